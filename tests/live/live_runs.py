@@ -1,5 +1,7 @@
 """Recordings pushed scan by scan."""
 
+from itertools import islice
+
 import numpy as np
 
 from stillmap.live.mapper import LiveMapper
@@ -22,11 +24,25 @@ class Run:
 
     @property
     def poses(self):
-        return np.array([update.pose for update in self.updates])
+        return poses_of(self.updates)
 
     @property
     def p_static(self):
         return np.concatenate([update.p_static for update in self.updates])
+
+
+def answers(recording, scans=None, **settings):
+    """What a new mapper answers to the scans of a recording, or the first of them."""
+    odometry = recording.T_odom_base
+    with LiveMapper({"threads": 1}, **settings) as mapper:
+        return [
+            mapper.push(beams, None if odometry is None else odometry[t])
+            for t, beams in enumerate(islice(iter_beams(recording), scans))
+        ]
+
+
+def poses_of(updates):
+    return np.array([update.pose for update in updates])
 
 
 def simulate_sweeps(scene, scans, seed=3):

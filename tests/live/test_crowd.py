@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from live_runs import answers, poses_of
 
 from stillmap.live.front_end import Crowd
-from stillmap.live.mapper import LiveMapper
-from stillmap.live.replay import iter_beams
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 
@@ -116,12 +115,8 @@ def test_the_map_stays_where_visitors_surround_the_robot(seed):
     changes = {"robot": {"scans": 300}, "laser": {"max_range": 8.0, "fov": math.pi}}
     simulation = simulate(scene_by_name("hall", {**changes, "crowd": {"people": 0}}), seed)
     recording = surrounded(simulation.recording, 20, 50)
-    with LiveMapper({"threads": 1}) as mapper:
-        poses = [
-            mapper.push(beams, recording.T_odom_base[t]).pose
-            for t, beams in enumerate(iter_beams(recording))
-        ]
+    poses = poses_of(answers(recording))
     true = simulation.truth.T_world_base
-    off = compute_absolute_errors(np.array(poses), true).rmse
+    off = compute_absolute_errors(poses, true).rmse
     assert off < 0.3
     assert off < 1.5 * compute_absolute_errors(recording.T_odom_base, true).rmse + 0.1

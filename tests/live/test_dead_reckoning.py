@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from live_runs import answers, poses_of
 
 from stillmap.core import se2
 from stillmap.live.dead_reckoning import DeadReckoning
@@ -48,25 +49,14 @@ def test_a_place_that_is_not_mapped_is_no_contradiction():
     recording, true = simulation.recording, simulation.truth.T_world_base
     hit = recording.hit.copy()
     hit[recording.beams_of(200).start : recording.beams_of(320).start] = False
-    with LiveMapper({"threads": 1}) as mapper:
-        updates = [
-            mapper.push(beams, recording.T_odom_base[t])
-            for t, beams in enumerate(iter_beams(replace(recording, hit=hit)))
-        ]
+    updates = answers(replace(recording, hit=hit))
     assert not any("carried" in one.doubts for one in updates)
     # of noise that was learned, not that of the options, which would be metres
     assert math.sqrt(updates[319].covariance[0, 0]) < 1.0
-    poses = np.array([one.pose for one in updates])
+    poses = poses_of(updates)
     off = poses[-1] - se2.inverse(true[0]) @ true[-1]
     assert np.hypot(*off[:2, 2]) < 3.0 * math.sqrt(updates[319].covariance[:2, :2].trace())
     assert compute_absolute_errors(poses, true).rmse < 0.4
-
-
-def drive(recording, odometry):
-    """(T, 3, 3) poses at the time, and all doubts."""
-    with LiveMapper({"threads": 1}) as mapper:
-        updates = [mapper.push(beams, odometry[t]) for t, beams in enumerate(iter_beams(recording))]
-    return np.array([one.pose for one in updates]), [one.doubts for one in updates]
 
 
 def simulated(world, seed, laser, scans):
@@ -88,7 +78,8 @@ def test_the_robot_was_not_carried_while_it_saw_nothing():
         odometry.append(
             odometry[-1] @ se2.inverse(before) @ after @ (turn if is_blind else np.eye(3))
         )
-    poses, doubts = drive(replace(recording, hit=hit), odometry)
+    updates = answers(replace(recording, hit=hit, T_odom_base=np.array(odometry)))
+    poses, doubts = poses_of(updates), [one.doubts for one in updates]
     assert all("blind" in one for one in doubts[150:250])
     assert not any("carried" in one for one in doubts)
     assert doubts[-1] == ()

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
+from live_runs import answers, poses_of
 
 from stillmap.core import se2
-from stillmap.live.mapper import LiveMapper
-from stillmap.live.replay import iter_beams
 from stillmap.live.scan_odometry import WallDirections, correct_heading
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.heading_alignment import HeadingOffset
@@ -86,13 +85,8 @@ def test_a_heading_takes_the_position_along():
 
 def drift(simulation):
     """RMS m that poses are off as they were given, from the first one."""
-    recording, truth = simulation.recording, simulation.truth.T_world_base
-    with LiveMapper({"threads": 1}) as mapper:
-        poses = [
-            mapper.push(beams, recording.T_odom_base[t]).pose
-            for t, beams in enumerate(iter_beams(recording))
-        ]
-    off = (np.array(poses) - se2.inverse(truth[0]) @ truth)[:, :2, 2]
+    truth = simulation.truth.T_world_base
+    off = (poses_of(answers(simulation.recording)) - se2.inverse(truth[0]) @ truth)[:, :2, 2]
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 

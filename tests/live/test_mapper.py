@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from live_runs import answers, poses_of
 
 import stillmap
 from stillmap.core import se2
@@ -180,14 +181,10 @@ def test_finishing_is_building(corridor):
     assert f1(found.p_static, corridor.truth.static, corridor.recording.hit) > 0.95
 
 
-def test_without_odometry(corridor, fresh):
-    mapper = fresh()
-    updates = [
-        mapper.push(beams)
-        for _, beams in zip(range(150), iter_beams(corridor.recording), strict=False)
-    ]
+def test_without_odometry(corridor):
+    updates = answers(corridor.recording.without_odometry(), 150)
     assert all(update.T_map_odom is None for update in updates)
-    poses = np.array([update.pose for update in updates])
+    poses = poses_of(updates)
     assert compute_absolute_errors(poses, corridor.truth.T_world_base[:150]).rmse < 0.06
 
 
@@ -252,7 +249,7 @@ def push_all(mapper, recording, count=None):
 def test_loops_are_closed_in_the_background(corridor, fresh):
     mapper = fresh(background=True)
     updates = push_all(mapper, corridor.recording)
-    poses = np.array([update.pose for update in updates])
+    poses = poses_of(updates)
     assert compute_absolute_errors(poses, corridor.truth.T_world_base).rmse < 0.06
     assert compute_absolute_errors(mapper.poses, corridor.truth.T_world_base).rmse < 0.06
 
@@ -274,13 +271,6 @@ def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh
     np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
     assert sum("closes loops" in record.message for record in caplog.records) == 1
     assert waiting[-1] <= waiting[10]  # nobody takes anything out
-
-
-def test_an_earlier_scan_is_labelled_again(corridor):
-    beams = next(itertools.islice(iter_beams(corridor.recording), 200, None))
-    labels = corridor.mapper.label(beams, 200)
-    static = corridor.truth.static[corridor.recording.beams_of(200)]
-    assert np.mean((labels > 0.5)[beams.hit] == static[beams.hit]) > 0.95
 
 
 def test_a_covariance_follows_the_axes_of_its_frame():

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from live_runs import answers, poses_of
 
 from stillmap.core import se2
 from stillmap.live.mapper import LiveMapper
@@ -41,8 +42,8 @@ def spin(scene, changes):
 def follow(scans):
     """Poses and doubts at the time."""
     with LiveMapper({"threads": 1}) as mapper:
-        answers = [mapper.push(*scan) for scan in scans]
-    return np.array([one.pose for one in answers]), [one.doubts for one in answers]
+        updates = [mapper.push(*scan) for scan in scans]
+    return poses_of(updates), [one.doubts for one in updates]
 
 
 @pytest.mark.parametrize("scene", ["office", "hall", "warehouse"])
@@ -62,8 +63,7 @@ def test_a_robot_that_drives_on_does_not_stand(scene):
     simulation = simulate(scene_by_name(scene, {"robot": {"scans": 170}, "laser": laser}), 6)
     recording = simulation.recording
     assert recording.T_odom_base is not None
-    _, doubts = follow(list(zip(iter_beams(recording), recording.T_odom_base, strict=True)))
-    assert not any("slip" in one for one in doubts)
+    assert not any("slip" in one.doubts for one in answers(recording))
 
 
 def test_the_standing_robot_is_free_to_move_on():

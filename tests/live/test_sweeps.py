@@ -46,18 +46,6 @@ def test_the_map_has_obstacles_above_the_ground(sweeps):
     assert np.mean(cells.p_occupied > 0.5) > 0.5
 
 
-def test_changed_parts_of_the_map_are_told(sweeps):
-    changes = [change for update in sweeps.updates for change in update.changes]
-    assert changes[0].p_occupied.shape == (8, 8, 8)
-    assert np.all(changes[0].first_cell % 8 == 0)
-
-
-def test_odometry_and_its_correction_give_the_pose(sweeps):
-    for t in (0, 30, 99):
-        update, T_odom_base = sweeps.updates[t], sweeps.recording.T_odom_base[t]
-        np.testing.assert_allclose(update.T_map_odom @ T_odom_base, update.pose, atol=1e-9)
-
-
 def test_threads_change_nothing():
     simulation = simulate_sweeps("hall", 12)
     one, two = (Run(simulation, threads) for threads in (1, 2))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from live_runs import answers, poses_of
 
 from stillmap.core import se2
 from stillmap.live.mapper import LiveMapper
@@ -52,19 +53,11 @@ def halves(beams):
 
 
 def errors_of(updates, simulation):
-    return compute_absolute_errors(
-        np.array([update.pose for update in updates]), simulation.truth.T_world_base
-    )
+    return compute_absolute_errors(poses_of(updates), simulation.truth.T_world_base)
 
 
 def test_poses_are_as_good_as_those_of_one_laser_that_sees_the_same(simulation, both):
-    recording = simulation.recording
-    with LiveMapper({"threads": 1}) as mapper:
-        one = [
-            mapper.push(beams, recording.T_odom_base[t])
-            for t, beams in enumerate(iter_beams(recording))
-        ]
-    wanted = errors_of(one, simulation).rmse
+    wanted = errors_of(answers(simulation.recording), simulation).rmse
     _, updates, is_front = both
     for name, of_laser in (("front", is_front), ("rear", ~is_front)):
         chosen = [update for update, is_its in zip(updates, of_laser, strict=True) if is_its]

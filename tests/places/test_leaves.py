@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.places.changes import Leaf, fit_leaf, is_hinged, turn_about_hinge
+from stillmap.places.door_leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
 
 CELL = 0.05
 

@@ -87,12 +87,6 @@ def test_only_cells_of_listed_changes_are_highlighted(place):
     assert not left.any()
 
 
-def test_first_session_has_no_changes(place):
-    _, came, left = read_timeline(place).cells_as_of(0)
-    assert not came.any()
-    assert not left.any()
-
-
 def test_place_without_changes(place):
     none = {"cells": np.zeros((0, 2), np.int32), "shown": np.zeros(0, bool)}
     none |= {name: np.zeros((0, 4), bool) for name in ("occupied", "observed")}
@@ -112,25 +106,17 @@ def changed(**fields):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("{", "damaged"),
         ("{}", "a valid array"),
-        ("[3]", "damaged"),
         ("[" * 100_000, "damaged"),
         (changed(kind="flew"), "1.kind: Input should be"),
-        (changed(kind=None), "1.kind: Field required"),
         (changed(box=[0, 0, 1]), "boxes in 2D and in 3D"),
-        (changed(box=[0, 0, 1, "1"]), "valid number"),
         (changed(box=[0, 0, 1, float("nan")]), "no number"),
         (changed(box=[1, 0, 0, 1]), "exchanged"),
-        (changed(box=[0, 0, 1, 1, 0, 1]), "2D and in 3D"),
         (changed(from_box=None), "no box of where it was"),
         (changed(between=["tuesday", "never"]), "damaged"),
-        (changed(between=["tuesday"]), "damaged"),
         (changed(between=["wednesday", "tuesday"]), "before it begins"),
         (changed(probability=1.5), "probability"),
-        (changed(probability=True), "valid number"),
         (changed(id=0), "one id"),
-        (changed(id=1e300), "valid integer"),
     ],
 )
 def test_damaged_changes_are_refused(place, content, said):
@@ -144,18 +130,12 @@ def test_damaged_changes_are_refused(place, content, said):
     "other",
     [
         {"cells": np.zeros((64, 3), np.int32)},
-        {"cells": np.zeros((64, 2))},
         {"cells": np.full((64, 2), 2**31 - 1, np.int32)},
-        {"cells": np.full((64, 2), -(2**31), np.int32)},
-        {"cells": np.zeros((), np.int32)},
         {"occupied": np.zeros((64, 5), bool)},
-        {"observed": np.zeros((64, 4), bool)},
         {"observed": np.ones((64, 4), np.uint8)},
         {"shown": np.zeros(63, bool)},
-        {"resolution": np.array(0.0)},
         {"resolution": np.array(np.nan)},
         {"resolution": np.array([CELL])},
-        {"sessions": np.array([1, 2, 3, 4])},
         {"sessions": np.array(["monday"] * 4)},
         {"sessions": np.array([*NAMES[:3], "friday"])},
     ],
@@ -171,13 +151,9 @@ def test_damaged_states_are_refused(place, other):
     ("name", "value"),
     [
         ("overlap", 1.5),
-        ("overlap", None),
-        ("first_stamp_ns", "0"),
         ("last_stamp_ns", 2**70),
-        ("T_place_session", [[1]]),
         ("T_place_session", [[1, 0, 0], [0, 1, 0], [0, 0, None]]),
         ("T_place_session", "here"),
-        ("name", "a\0b"),
         ("name", "../monday"),
         ("accepted", 1),
     ],

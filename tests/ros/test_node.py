@@ -179,12 +179,12 @@ def check_map(simulation, grid):
 @pytest.mark.parametrize(
     ("parameter", "says"),
     [
-        ("resolution:=-1.0", "parameter resolution: expected more than 0, got -1.0"),
-        ("map_frame:=3", "parameter map_frame: expected text, got 3"),
+        ("resolution:=-1.0", "'resolution' must be more than 0, got -1.0"),
+        ("map_frame:=3", "'map_frame' must be a valid string, got 3"),
         ("resolution=", "arguments of ROS"),
     ],
 )
-def test_wrong_parameters_are_told_in_one_line(tf_environment, start_node, parameter, says):
+def test_wrong_parameters_are_named_in_one_line(tf_environment, start_node, parameter, says):
     node = start_node(tf_environment, parameter)
     assert node.wait() == 2
     assert says in node.text

@@ -4,7 +4,6 @@ import logging
 import math
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from foxglove import Context, channels, start_server
@@ -34,14 +33,14 @@ _OCCUPIED = 0.65  # P(occupied) of the voxels that are shown in 3D
 _MOVER_HEIGHT, _PATH_HEIGHT = 1.7, 0.02  # m
 _VOXELS: Rgb = (80, 80, 80)
 _POINT = np.dtype([("position", "<f4", 3), ("color", "u1", 4), ("p_static", "<f4")])
-_FLOAT, _BYTE = fox.PackedElementFieldNumericType.Float32, fox.PackedElementFieldNumericType.Uint8
+_Field, _Kind = fox.PackedElementField, fox.PackedElementFieldNumericType
 _CELL = ("red", "green", "blue", "alpha", "occupancy")
+_CELL_FIELDS = [_Field(name=name, offset=k, type=_Kind.Uint8) for k, name in enumerate(_CELL)]
 _POINT_FIELDS = [
-    *((name, 4 * k, _FLOAT) for k, name in enumerate("xyz")),
-    *((name, 12 + k, _BYTE) for k, name in enumerate(_CELL[:4])),
-    ("p_static", 16, _FLOAT),
+    *(_Field(name=name, offset=4 * k, type=_Kind.Float32) for k, name in enumerate("xyz")),
+    *(_Field(name=name, offset=12 + k, type=_Kind.Uint8) for k, name in enumerate(_CELL[:4])),
+    _Field(name="p_static", offset=16, type=_Kind.Float32),
 ]
-_CELL_FIELDS = [(name, k, _BYTE) for k, name in enumerate(_CELL)]
 
 
 class FoxgloveServer(ServerListener):
@@ -209,7 +208,7 @@ def to_grid(grid: GridMap, stamp: fox.Timestamp) -> fox.Grid:
         cell_size=fox.Vector2(x=edge, y=edge),
         row_stride=5 * p.shape[1],
         cell_stride=5,
-        fields=_fields(_CELL_FIELDS),
+        fields=_CELL_FIELDS,
         data=cells.tobytes(),
     )
 
@@ -247,7 +246,7 @@ def to_log(doubts: tuple[str, ...], stamp: fox.Timestamp) -> fox.Log:
 def _mover(stamp: fox.Timestamp, mover: Mover) -> fox.SceneEntity:
     x, y, z = _lift(mover.position[None], 0.5 * _MOVER_HEIGHT)[0].tolist()
     speed = math.hypot(*mover.velocity)
-    half = 0.5 * math.atan2(mover.velocity[1], mover.velocity[0])
+    heading = se2.matrix(0.0, 0.0, math.atan2(mover.velocity[1], mover.velocity[0]))
     top, upright = fox.Vector3(x=x, y=y, z=z + 0.5 * _MOVER_HEIGHT), fox.Quaternion(w=1.0)
     body = fox.CylinderPrimitive(
         pose=fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=upright),
@@ -257,7 +256,7 @@ def _mover(stamp: fox.Timestamp, mover: Mover) -> fox.SceneEntity:
         color=_color(ORANGE, 0.5),
     )
     arrow = fox.ArrowPrimitive(
-        pose=fox.Pose(position=top, orientation=fox.Quaternion(z=math.sin(half), w=math.cos(half))),
+        pose=fox.Pose(position=top, orientation=_rotation(heading)),
         shaft_length=0.8 * speed,
         shaft_diameter=0.1,
         head_length=0.2 * speed,
@@ -295,13 +294,9 @@ def _cloud(
         frame_id=MAP,
         pose=_pose(T),
         point_stride=_POINT.itemsize,
-        fields=_fields(_POINT_FIELDS),
+        fields=_POINT_FIELDS,
         data=rows.tobytes(),
     )
-
-
-def _fields(fields: list[tuple[str, int, Any]]) -> list[fox.PackedElementField]:
-    return [fox.PackedElementField(name=name, offset=k, type=kind) for name, k, kind in fields]
 
 
 def _lift(points: NDArray[np.floating], z: float = 0.0) -> NDArray[np.floating]:

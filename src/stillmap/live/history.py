@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.arrays import GrowingArray
 from stillmap.core.errors import InputError, cannot_write
@@ -87,36 +87,37 @@ class History:
         self._count, self._beam_count, self._is_full = 0, 0, False
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
+        self._noted: tuple[int, bool, bool] | None = None  # in the header
         try:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
-            self._make_arrays(folder)
+            self._make_arrays()
         except OSError as error:
             raise cannot_write(error, folder or scratch or "") from error
 
-    def _make_arrays(self, folder: Path | None) -> None:
-        D = self._dimension
-        T = (D + 1, D + 1)
-
-        def make(name: str, dtype: Any, row: tuple[int, ...] = ()) -> GrowingArray:
-            path = None if folder is None else folder / f"{name}.npy"
-            return GrowingArray(dtype, row, path, self._scratch)
-
-        self._points = make("points", np.float32, (D,))
-        self._hit = make("hit", np.bool_)
-        self._times = make("beam_time", np.float32)
-        self._sensors = make("T_base_sensor", np.float64, T)
-        self._odometry = make("T_odom_base", np.float64, T)
-        self._sensor = make("sensor", np.int32)
-        self._stamps = make("stamp_ns", np.int64)
-        self._offset = make("offset", np.int64)  # the last: a scan is whole where its end is there
-        self._offset.append(np.zeros(1, np.int64))
-        pose = (np.float64, T)
-        fields = [("pose", *pose), ("local", *pose), ("anchor", np.int64)]
-        answer = np.dtype([*fields, ("twist", np.float64, 3 if D == 2 else 6)], align=True)
-        self._p_static = GrowingArray(np.float32, (), None, self._scratch)
-        self._answers = GrowingArray(answer, (), None, self._scratch)
+    def _make_arrays(self) -> None:
+        D, pose = self._dimension, (self._dimension + 1,) * 2
+        rows: dict[str, tuple[DTypeLike, tuple[int, ...]]] = {
+            "points": (np.float32, (D,)),
+            "hit": (np.bool_, ()),
+            "beam_time": (np.float32, ()),
+            "T_base_sensor": (np.float64, pose),
+            "T_odom_base": (np.float64, pose),
+            "sensor": (np.int32, ()),
+            "stamp_ns": (np.int64, ()),
+            "offset": (np.int64, ()),  # the last: a scan is whole where its end is there
+        }
+        folder, scratch = self.folder, self._scratch
+        self._recorded = {
+            name: GrowingArray(*of, None if folder is None else folder / f"{name}.npy", scratch)
+            for name, of in rows.items()
+        }
+        self._recorded["offset"].append(np.zeros(1, np.int64))
+        poses = [("pose", np.float64, pose), ("local", np.float64, pose), ("anchor", np.int64)]
+        answer = np.dtype([*poses, ("twist", np.float64, 3 * (D - 1))], align=True)
+        self._answers = GrowingArray(answer, (), None, scratch)
+        self._p_static = GrowingArray(np.float32, (), None, scratch)
 
     def __len__(self) -> int:
         return self._count
@@ -124,34 +125,33 @@ class History:
     @property
     def kept(self) -> int:
         """Number of the first scans that are kept: all, unless the disk was full."""
-        return len(self._offset) - 1
+        return len(self._recorded["offset"]) - 1
 
     def append(
         self,
         beams: ScanBeams,
         p_static: NDArray[np.float32],
         T_odom_base: Float | None,
-        pose: Float,
-        local: Float,
-        anchor: int,
-        twist: Float,
+        **answer: Float | int,
     ) -> None:
-        """Append a scan and the answer to it; see `Answers`.
+        """Append a scan and the answer to it.
 
         Args:
             beams: of the scan.
             p_static: (N,).
             T_odom_base: (D+1, D+1); None: without odometry.
-            pose: (D+1, D+1).
-            local: (D+1, D+1).
-            anchor: a spaced scan.
-            twist: (3,) or (6,) m/s and rad/s of the base during the scan, in its own frame.
+            answer: `pose`, `local` and `anchor`, see `Answers`; `twist` (3,) or (6,) m/s and rad/s
+                of the base during the scan, in its own frame.
         """
         self._count += 1
         if self._is_full:
             return
+        row = np.zeros(1, self._answers.dtype)
+        for name, value in answer.items():
+            row[name] = value
         try:
-            self._append_answer(p_static, pose, local, anchor, twist)
+            self._p_static.append(p_static)
+            self._answers.append(row)
             self._append_scan(beams, T_odom_base)
         except OSError as error:
             self._end(error.strerror or str(error))
@@ -160,42 +160,40 @@ class History:
         if self._beam_count * row_bytes > self._max_bytes:
             self._end(f"{self._max_bytes / 1e9:g} GB of beams are kept")
 
-    def _append_answer(
-        self, p_static: NDArray[np.float32], pose: Float, local: Float, anchor: int, twist: Float
-    ) -> None:
-        answer = np.zeros(1, self._answers.dtype)
-        answer["pose"], answer["local"] = pose, local
-        answer["anchor"], answer["twist"] = anchor, twist
-        self._p_static.append(p_static)
-        self._answers.append(answer)
-
     def _append_scan(self, beams: ScanBeams, T_odom_base: Float | None) -> None:
-        times = beams.beam_time
-        self._points.append(beams.points)
-        self._hit.append(beams.hit)
-        self._times.append(np.zeros(len(beams.points), np.float32) if times is None else times)
-        known = len(self._mounts), self._has_odometry, self._has_times
+        times, end = beams.beam_time, self._beam_count + len(beams.points)
         if beams.sensor not in self._mounts:
-            self._sensors.append(beams.T_base_sensor[None])
+            self._recorded["T_base_sensor"].append(beams.T_base_sensor)
             self._mounts[beams.sensor] = beams.T_base_sensor
         self._has_odometry &= T_odom_base is not None
         self._has_times |= times is not None
-        if known != (len(self._mounts), self._has_odometry, self._has_times):
+        known = len(self._mounts), self._has_odometry, self._has_times
+        if known != self._noted:
             self._write_header(is_open=True)
-        nowhere = np.full(beams.T_base_sensor.shape, np.nan)
-        self._odometry.append((nowhere if T_odom_base is None else T_odom_base)[None])
-        self._sensor.append(np.array([list(self._mounts).index(beams.sensor)]))
-        self._stamps.append(np.array([beams.stamp_ns]))
-        self._offset.append(np.array([self._beam_count + len(beams.points)]))
-        self._beam_count += len(beams.points)
+            self._noted = known
+        unknown = np.full(beams.T_base_sensor.shape, np.nan)
+        rows: dict[str, Any] = {
+            "points": beams.points,
+            "hit": beams.hit,
+            "beam_time": np.zeros(len(beams.points)) if times is None else times,
+            "T_odom_base": unknown if T_odom_base is None else T_odom_base,
+            "sensor": list(self._mounts).index(beams.sensor),
+            "stamp_ns": beams.stamp_ns,
+            "offset": end,
+        }
+        for name, values in rows.items():
+            self._recorded[name].append(values)
+        self._beam_count = end
 
     def _end(self, why: str) -> None:
         """Keep no more scans: what was begun of the last one goes."""
         self._is_full = True
-        for array in (self._points, self._hit, self._times, self._p_static):
-            array.truncate(self._beam_count)
-        for array in (self._odometry, self._sensor, self._stamps, self._answers):
-            array.truncate(self.kept)
+        for name, array in (*self._recorded.items(), ("p_static", self._p_static)):
+            if name in ("points", "hit", "beam_time", "p_static"):
+                array.truncate(self._beam_count)
+            elif name in ("T_odom_base", "sensor", "stamp_ns"):
+                array.truncate(self.kept)
+        self._answers.truncate(self.kept)
         where = self.folder or self._scratch or "temporary files"
         _log.error("%s: %s: poses go on, but from here on no scan is kept", where, why)
 
@@ -230,18 +228,6 @@ class History:
         path = {} if self.folder is None else {"path": os.path.abspath(self.folder)}
         return {**path, "format": "live", "sensors": sensors, "warnings": warnings}
 
-    def finish(self) -> None:
-        """Enter what is in the recording folder into its headers; appending may go on.
-
-        Raises:
-            OSError: the disk is full.
-        """
-        if self.folder is None:
-            return
-        for array in self._recorded:
-            array.write_length()
-        self._write_header(is_open=False)
-
     def move(self, folder: Path) -> None:
         """Move the recording folder.
 
@@ -254,29 +240,18 @@ class History:
         os.replace(self.folder, folder)
         self.folder = folder
 
-    @property
-    def _recorded(self) -> list[GrowingArray]:
-        """The arrays of the recording."""
-        of_beams = [self._points, self._hit, self._times]
-        return [*of_beams, self._sensors, self._odometry, self._sensor, self._stamps, self._offset]
-
     def close(self) -> None:
         """Close the files; the recording folder says how long they are."""
-        with suppress(OSError):
-            self.finish()
-        for array in (*self._recorded, self._p_static, self._answers):
+        with suppress(OSError):  # the disk is full: the folder stays open
+            if self.folder is not None:
+                for array in self._recorded.values():
+                    array.write_length()
+                self._write_header(is_open=False)
+        for array in (*self._recorded.values(), self._p_static, self._answers):
             array.close()
 
-    def at(self, number: int) -> tuple[int, Float]:
-        """Anchor and local pose of a scan that is kept, see `Answers`."""
-        answer = self._answer(number)
-        return int(answer["anchor"]), np.array(answer["local"])
-
-    def twist_at(self, number: int) -> Float:
-        """(3,) or (6,) m/s and rad/s of the base during a scan that is kept."""
-        return np.array(self._answer(number)["twist"])
-
-    def _answer(self, number: int) -> Any:
+    def answer(self, number: int) -> Any:
+        """The answer to a scan that is kept, see `append`."""
         if number >= self.kept:
             raise InputError(f"scan {number}: is not kept, for the disk was full")
         return self._answers.row(number)
@@ -289,15 +264,16 @@ class History:
 
     def recording(self) -> Recording:
         """The scans that are kept, while more are appended; odometry only if all have it."""
+        arrays = {name: array.view() for name, array in self._recorded.items()}
         return Recording(
-            stamp_ns=np.array(self._stamps.view()),
-            offset=np.array(self._offset.view()),
-            points=self._points.view(),
-            hit=self._hit.view(),
+            stamp_ns=np.array(arrays["stamp_ns"]),
+            offset=np.array(arrays["offset"]),
+            points=arrays["points"],
+            hit=arrays["hit"],
             T_base_sensor=np.array(list(self._mounts.values())),
-            sensor=np.array(self._sensor.view()),
-            T_odom_base=np.array(self._odometry.view()) if self._has_odometry else None,
+            sensor=np.array(arrays["sensor"]),
+            T_odom_base=np.array(arrays["T_odom_base"]) if self._has_odometry else None,
             source=self._source(),
-            beam_time=self._times.view() if self._has_times else None,
+            beam_time=arrays["beam_time"] if self._has_times else None,
             scratch=self._scratch,
         )

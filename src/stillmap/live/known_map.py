@@ -2,9 +2,7 @@
 
 import dataclasses
 import os
-from collections import deque
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +18,11 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.live.local_map import (
     Labeller,
+    LocalMap,
     MappedScan,
     add_scan,
     is_spaced,
     relabel_scan,
-    take_until,
 )
 from stillmap.pipeline.options import MapMode
 from stillmap.places.evidence import cell_keys
@@ -109,54 +107,38 @@ class KeptMap(ShortRepr):
     cloud: KeptCloud | None = None
 
 
-class Overlay:
-    """The box around two maps with the same axes and cells, one of which lies on the other.
-
-    Args:
-        below, above: the maps.
-    """
+class _Overlay:
+    """The box around two maps with the same axes and cells, one of which lies on the other."""
 
     def __init__(self, below: GridMap, above: GridMap) -> None:
         edge = above.resolution
-        shapes = [np.array(one.p_occupied.shape) for one in (below, above)]
-        corners = [
-            np.round(np.array(one.origin[1::-1]) / edge).astype(int) for one in (below, above)
-        ]
-        low = np.minimum(*corners)
-        high = np.maximum(*(a + n for a, n in zip(corners, shapes, strict=True)))
-        self.shape = tuple((high - low).tolist())
+        shapes = np.array([one.p_occupied.shape for one in (below, above)])
+        corners = np.array([one.origin[1::-1] for one in (below, above)])
+        corners = np.round(corners / edge).astype(int)
+        low, high = corners.min(axis=0), (corners + shapes).max(axis=0)
+        self._shape, self._corners = tuple((high - low).tolist()), corners - low
         y, x = (low * edge).tolist()
         self.origin = (x, y, 0.0)
-        self._below, self._above = (
-            tuple(slice(a, a + n) for a, n in zip((corner - low).tolist(), shape, strict=True))
-            for corner, shape in zip(corners, np.array(shapes).tolist(), strict=True)
-        )
 
-    def lay(
-        self,
-        fill: float,
-        below: NDArray[np.floating],
-        above: NDArray[np.floating],
-        use: NDArray[np.bool_],
-    ) -> Layer:
-        """A layer of both: `above` where `use`, `below` elsewhere, `fill` where there is none."""
-        out = np.full(self.shape, fill, np.float32)
-        out[self._below] = below
-        out[self._above][use] = np.asarray(above)[use]
+    def below(self, layer: NDArray[np.floating], fill: float) -> Layer:
+        """A layer of the lower map on the box; `fill` outside it."""
+        return self._spread(layer, fill, self._corners[0])
+
+    def above(self, layer: NDArray[np.floating], fill: float) -> Layer:
+        """The same of the upper one."""
+        return self._spread(layer, fill, self._corners[1])
+
+    def _spread(self, layer: NDArray[np.floating], fill: float, corner: NDArray[np.intp]) -> Layer:
+        out, (row, column) = np.full(self._shape, fill, np.float32), corner.tolist()
+        out[row : row + layer.shape[0], column : column + layer.shape[1]] = layer
         return out
-
-    def find_below(self, fill: float, below: NDArray[np.floating]) -> Layer:
-        """Values of the lower map in the cells of the upper one; `fill` outside it."""
-        out = np.full(self.shape, fill, np.float32)
-        out[self._below] = below
-        return out[self._above]
 
 
 def overlay(below: GridMap, above: GridMap) -> GridMap:
     """A map on which another one lies, where that one is known."""
-    box = Overlay(below, above)
-    seen = np.asarray(above.p_occupied)
-    p_occupied = box.lay(np.nan, below.p_occupied, seen, ~np.isnan(seen))
+    box = _Overlay(below, above)
+    seen = box.above(above.p_occupied, np.nan)
+    p_occupied = np.where(np.isnan(seen), box.below(below.p_occupied, np.nan), seen)
     return GridMap(p_occupied, box.origin, above.resolution)
 
 
@@ -169,17 +151,17 @@ def extend_map(kept: KeptMap, seen: OccupancyMap) -> OccupancyMap:
         kept: a map whose axes are those of `seen`.
         seen: the map of this run.
     """
-    known, p = kept.grid, np.asarray(seen.p_occupied)
-    box, use = Overlay(known, seen), ~np.isnan(p)
+    box, known = _Overlay(kept.grid, seen), kept.grid.p_occupied
+    p = box.above(seen.p_occupied, np.nan)
+    use = ~np.isnan(p)
     if kept.cloud is not None:
-        standing = np.where(kept.cloud.stands, known.p_occupied, np.nan)
-        use &= ~(box.find_below(np.nan, standing) > p)
+        use &= ~(box.below(np.where(kept.cloud.stands, known, np.nan), np.nan) > p)
     return OccupancyMap(
-        box.lay(np.nan, known.p_occupied, p, use),
+        np.where(use, p, box.below(known, np.nan)),
         box.origin,
         seen.resolution,
-        box.lay(0.0, kept.hits, seen.alpha, use),
-        box.lay(0.0, np.zeros_like(kept.hits), seen.beta, use),
+        np.where(use, box.above(seen.alpha, 0.0), box.below(kept.hits, 0.0)),
+        np.where(use, box.above(seen.beta, 0.0), np.float32(0.0)),
     )
 
 
@@ -259,8 +241,8 @@ class KnownMap:
         labels.prime(np.ascontiguousarray(cells), occupied, LOG_RATIO)
 
 
-class KnownLocalMap:
-    """A known map in place of a local one.
+class KnownLocalMap(LocalMap):
+    """A known map in place of a local one: nothing leaves it.
 
     Args:
         known: the map.
@@ -268,10 +250,8 @@ class KnownLocalMap:
     """
 
     def __init__(self, known: KnownMap, extends: bool) -> None:
-        self.grid = known.make_grid()
-        self._extends = extends
-        self._last: dict[str | int, MappedScan] = {}
-        self._recent = deque[MappedScan]()  # that are to be labelled again
+        super().__init__(known.resolution)
+        self.grid, self._extends = known.make_grid(), extends
 
     def add(self, scan: MappedScan) -> bool:
         """Note a scan unless it is too close to the last one of its sensor; True if it was noted.
@@ -285,16 +265,8 @@ class KnownLocalMap:
             self._recent.append(scan)
         return True
 
-    def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
-        """Give the scans added up to then, or so many of them, the labels that are known by now,
-        each once; the number of scans."""
-        due = list(islice(take_until(self._recent, until_ns), most))
-        for scan in due:
-            relabel_scan(self.grid, scan, label)
-        return len(due)
-
-    def remove_before(self, travelled: float, most: int | None = None) -> None:
-        """Nothing leaves a known map."""
+    def _relabel(self, scan: MappedScan, label: Labeller) -> None:
+        relabel_scan(self.grid, scan, label)
 
     def remove_since(self, stamp_ns: int) -> None:
         """Nothing leaves a known map."""

@@ -3,9 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,28 +50,6 @@ def thin_scan(scan: MappedScan, max_beams: int) -> MappedScan:
 Labeller = Callable[[MappedScan], NDArray[np.float32]]  # P(static) (N,) of a scan
 
 
-class MatchMap(Protocol):
-    """A map that scans are matched against: a `LocalMap`, or a `KnownLocalMap`."""
-
-    grid: _core.OccupancyGrid2D
-
-    def add(self, scan: MappedScan) -> bool:
-        """Add or note a scan; False if it is too close to the last one of its sensor."""
-
-    def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
-        """Give the scans added up to then, or so many of them, the labels that are known by now,
-        each once; the number of scans."""
-
-    def remove_before(self, travelled: float, most: int | None = None) -> None:
-        """Remove the scans taken before that many metres of travel, or so many of them."""
-
-    def remove_since(self, stamp_ns: int) -> None:
-        """Remove the scans taken since."""
-
-    def has_sensor(self, sensor: str | int, /) -> bool:
-        """True if it shows what a sensor sees."""
-
-
 class LocalMap:
     """A map of spaced scans.
 
@@ -105,16 +81,36 @@ class LocalMap:
         self._recent.append(scan)
         return True
 
+    def tend(self, stamp_ns: int, travelled: float, label: Labeller, most: int | None) -> None:
+        """Label scans again after a second, and remove those of long ago.
+
+        Args:
+            stamp_ns: now.
+            travelled: m of travel so far.
+            label: labels an earlier scan by what is known by now.
+            most: scans for which this is done now, unless it is overdue; None: all.
+        """
+        due_ns, before = stamp_ns - _LABELLED_AFTER_NS, travelled - _MAX_TRAVEL
+        if most is not None:
+            most -= self.relabel(due_ns, label, most)
+            self.remove_before(before, most)
+            due_ns, before = due_ns - _MAX_DELAY_NS, before - _MAX_DELAY
+        self.relabel(due_ns, label)
+        self.remove_before(before)
+
     def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
         """Give the scans added up to then, or so many of them, the labels that are known by now,
         each once; the number of scans."""
         count = 0
-        for scan in islice(take_until(self._recent, until_ns), most):
-            at = next((k for k, one in enumerate(self._scans) if one is scan), None)
-            if at is not None:
-                self._scans[at] = relabel_scan(self.grid, scan, label)
+        while self._recent and self._recent[0].beams.stamp_ns <= until_ns and count != most:
+            self._relabel(self._recent.popleft(), label)
             count += 1
         return count
+
+    def _relabel(self, scan: MappedScan, label: Labeller) -> None:
+        at = next((k for k, mapped in enumerate(self._scans) if mapped is scan), None)
+        if at is not None:
+            self._scans[at] = relabel_scan(self.grid, scan, label)
 
     def remove_before(self, travelled: float, most: int | None = None) -> None:
         """Remove the scans taken before that many metres of travel, or so many of them."""
@@ -142,30 +138,6 @@ class LocalMap:
         last = self._last.get(scan.beams.sensor)
         if last is None or last.beams.stamp_ns <= scan.beams.stamp_ns:
             self._last[scan.beams.sensor] = scan
-
-
-def tend(
-    local_map: MatchMap, stamp_ns: int, travelled: float, label: Labeller, most: int | None
-) -> None:
-    """Label the scans of a map again after a second, and remove those of long ago.
-
-    Args:
-        local_map: at a time, after so many metres of travel.
-        most: scans for which this is done now, unless it is overdue; None: all.
-    """
-    due_ns, left = stamp_ns - _LABELLED_AFTER_NS, travelled - _MAX_TRAVEL
-    if most is not None:
-        most -= local_map.relabel(due_ns, label, most)
-        local_map.remove_before(left, most)
-        due_ns, left = due_ns - _MAX_DELAY_NS, left - _MAX_DELAY
-    local_map.relabel(due_ns, label)
-    local_map.remove_before(left)
-
-
-def take_until(scans: deque[MappedScan], until_ns: int) -> Iterable[MappedScan]:
-    """Take the scans up to then out of a queue."""
-    while scans and scans[0].beams.stamp_ns <= until_ns:
-        yield scans.popleft()
 
 
 def relabel_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, label: Labeller) -> MappedScan:

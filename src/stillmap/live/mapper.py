@@ -7,30 +7,34 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.from_arrays import poses_to_matrices
+from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.live.online_slam import OnlineSlam
-from stillmap.live.place import Mode, adopt_resolution, make_tracker
+from stillmap.live.place import Localizer, PlanarLocalizer
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
+from stillmap.live.sweep_localization import SweepLocalizer
 from stillmap.live.sweep_view import empty_map, project_obstacles
 from stillmap.live.update import Update
-from stillmap.pipeline.options import Options, resolve_resolution
+from stillmap.pipeline.options import DEFAULTS, Options, resolve_resolution
 from stillmap.prepare.plausibility import mapped_range, shorten_far_beams
 from stillmap.results.result import Result, to_options
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
+Mode = Literal["localise", "extend"]
 
 _MIN_SCRATCH = 100_000  # bytes: some scans at least
 
@@ -85,7 +89,7 @@ class LiveMapper:
         self._source, self._mode = place, mode
         self._known = None if place is None else KnownMap(place)
         if self._known is not None and mode == "extend":
-            self.options = adopt_resolution(self.options, self._known)
+            self.options = _adopt_resolution(self.options, self._known, 2)
         self._in_background, self._max_scratch, self._lag = background, max_scratch, lag
         self._folder = None if folder is None else Path(folder)
         self._scratch = None if scratch is None else Path(scratch)
@@ -167,13 +171,12 @@ class LiveMapper:
     @property
     def cells(self) -> CellProbabilities:
         """P(static and occupied) of the cells, in 3D voxels, in which beams ended."""
-        found, frame = self._cells(), LocalFrame()
-        if self._slam is not None:
-            frame = self._slam.known_frame
-        if not frame.is_shifted:
-            return found
-        by = np.round(frame.origin[: found.cells.shape[1]] / self.resolution).astype(np.int64)
-        return dataclasses.replace(found, cells=found.cells + by)
+        known = self._cells()
+        if self._slam is None or not self._slam.known_frame.is_shifted:
+            return known
+        origin = self._slam.known_frame.origin[: known.cells.shape[1]]
+        by = np.round(origin / self.resolution).astype(np.int64)
+        return dataclasses.replace(known, cells=known.cells + by)
 
     def _cells(self) -> CellProbabilities:
         """The same in the frame of the labels."""
@@ -259,21 +262,28 @@ class LiveMapper:
         """Begin mapping with the first scan, in its dimension."""
         if self._mapping is not None:  # of a first scan that could not be mapped
             self._mapping.close()
-        place = None
-        if self._source is not None and self._known is not None:
-            if self._mode == "extend" and dimension == 3:
-                self.options = adopt_resolution(self.options, self._known, 3)
-            place = make_tracker(self._source, self._known, self._mode, dimension, self.options)
+        localizer = self._make_localizer(dimension)  # which may change the options
         return OnlineSlam(
             dimension,
             self.options,
-            place,
+            localizer,
             in_background=self._in_background,
             folder=self._folder,
             scratch=self._scratch,
             max_scratch=self._max_scratch,
             lag=self._lag,
         )
+
+    def _make_localizer(self, dimension: int) -> Localizer | None:
+        known, extends = self._known, self._mode == "extend"
+        if self._source is None or known is None:
+            return None
+        if dimension == 2:
+            return PlanarLocalizer(known, extends)
+        if extends:
+            self.options = _adopt_resolution(self.options, known, 3)
+        threads = resolve_threads(self.options.threads)
+        return SweepLocalizer(KnownCloud(self._source, known), extends, self.options, threads)
 
     @property
     def _slam(self) -> OnlineSlam | None:
@@ -318,3 +328,17 @@ def _to_matrix(odometry: ArrayLike | None, dimension: int) -> Float | None:
     given = np.asarray(odometry, np.float64)[None]
     out: Float = poses_to_matrices("odometry", given, 1, dimension)[0]
     return out
+
+
+def _adopt_resolution(options: Options, known: KnownMap, dimension: int) -> Options:
+    """The options with the edge of the cells of a map that is extended, in 3D of its voxels.
+
+    Raises:
+        InputError: they ask for another one.
+    """
+    name, edge = "resolution" if dimension == 2 else "voxel_size", known.resolution
+    given = getattr(options.slam, name)
+    if given != getattr(DEFAULTS.slam, name) and not np.isclose(given, edge):
+        hint = f"it is extended with slam.{name}={edge:g}"
+        raise InputError(f"the map has cells of {edge:g} m", hint=hint)
+    return override(options, {"slam": {name: edge}})

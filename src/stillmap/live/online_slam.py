@@ -20,7 +20,7 @@ from stillmap.live.loop_process import start_closer
 from stillmap.live.map_frame import LabelledScan, MapFrame, rotate_covariance
 from stillmap.live.movers import Mover, MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins, normals_of, thin
-from stillmap.live.place import PlaceTracker
+from stillmap.live.place import Localizer
 from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_odometry import ScanOdometry
@@ -60,7 +60,7 @@ class OnlineSlam:
         self,
         dimension: int,
         options: Options,
-        place: PlaceTracker | None = None,
+        place: Localizer | None = None,
         *,
         in_background: bool = False,
         folder: Path | None = None,
@@ -115,7 +115,15 @@ class OnlineSlam:
         answer, p_static = self.known_frame.to_map(pose), p_static.copy()  # the user has the other
 
         def keep() -> MappedScan | None:
-            self.history.append(beams, p_static, T_odom_base, answer, found.T, anchor, found.twist)
+            self.history.append(
+                beams,
+                p_static,
+                T_odom_base,
+                pose=answer,
+                local=found.T,
+                anchor=anchor,
+                twist=found.twist,
+            )
             self._hindsight.add(len(self.history) - 1, beams)
             return self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
 
@@ -141,9 +149,10 @@ class OnlineSlam:
             beams: as they were pushed.
             number: how many scans were pushed before it.
         """
-        anchor, local = self.history.at(number)
-        pose = self.frame.to_map(self._finder.move(local, number), anchor, number)
-        return self.labels.label(deskew(beams, self.history.twist_at(number)), pose)
+        answer = self.history.answer(number)
+        local = self._finder.move(answer["local"], number)
+        pose = self.frame.to_map(local, int(answer["anchor"]), number)
+        return self.labels.label(deskew(beams, answer["twist"]), pose)
 
     def placement(self) -> Placement:
         """Poses and submaps of the scans that are kept, as they are estimated now."""

@@ -1,8 +1,6 @@
 """A recording pushed through the live mapper, as fast as possible or at its own pace."""
 
-import resource
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.interrupts import defers_signals_in, send_again
-from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.profiling import Progress, no_progress, peak_memory_bytes
 from stillmap.core.recording import Recording
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.scan import ScanBeams
 from stillmap.live.update import Update
 
 Show = Callable[[LiveMapper, ScanBeams, Update], None]
-
-_MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +90,7 @@ def replay(
             show(mapper, beams, update)
         mapper.update_map()
         progress("mapping", 0, t + 1, recording.n_scans)
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT
-    return Latency(np.array(seconds), dropped, used)
+    return Latency(np.array(seconds), dropped, peak_memory_bytes())
 
 
 def iter_beams(recording: Recording) -> Iterator[ScanBeams]:

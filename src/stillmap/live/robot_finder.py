@@ -12,9 +12,9 @@ from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.front_end import FrontEnd
 from stillmap.live.global_localization import MIN_AGREE_ANYWHERE, GlobalLocalizer
 from stillmap.live.known_map import KnownMap
-from stillmap.live.local_map import LocalMap, MatchMap
+from stillmap.live.local_map import LocalMap
 from stillmap.live.map_frame import MapFrame
-from stillmap.live.place import PlaceTracker
+from stillmap.live.place import Localizer
 from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
@@ -34,9 +34,7 @@ class Relocalizer:
         T_map_local: (3, 3) of the frame of the odometry by scans.
     """
 
-    covariance = _COVARIANCE
-
-    def __init__(self, labels: CausalLabels, local_map: MatchMap, T_map_local: Float) -> None:
+    def __init__(self, labels: CausalLabels, local_map: LocalMap, T_map_local: Float) -> None:
         self._filter, self._local_map = labels.filter, local_map
         self._T_map_local = T_map_local
         try:
@@ -71,15 +69,14 @@ class Relocalizer:
         out: Float = se2.inverse(self._T_map_local) @ found.T @ self._T_map_local
         return out
 
-    def join(self, labels: CausalLabels, local_map: MatchMap, T: Float) -> MatchMap:
+    def join(self, labels: CausalLabels, local_map: LocalMap, T: Float) -> LocalMap:
         """The map of before with what was seen since, moved by T (3, 3) of `localize`: the labels
         become those of both, and the local map of both is returned."""
         motion = self._T_map_local @ T @ se2.inverse(self._T_map_local)
         seen = labels.filter
         take_over(self._filter, seen, np.tile(motion, (labels.tags, 1, 1)), 0, seen.block_count)
         labels.filter = self._filter
-        if isinstance(self._local_map, LocalMap) and isinstance(local_map, LocalMap):
-            self._local_map.join(local_map, T)
+        self._local_map.join(local_map, T)
         return self._local_map
 
 
@@ -112,7 +109,7 @@ class RobotFinder:
             until loops are closed with the map.
     """
 
-    def __init__(self, place: PlaceTracker | None, dimension: int) -> None:
+    def __init__(self, place: Localizer | None, dimension: int) -> None:
         self._place, self._dimension = place, dimension
         self._carried: Relocalizer | None = None
         # in 3D before it was carried: cells of the labels, and poses of the spaced scans
@@ -179,7 +176,7 @@ class RobotFinder:
 
         Args:
             labels: of what was seen since it was lost.
-            scan: the last one, see `PlaceTracker.localize`.
+            scan: the last one, see `Localizer.localize`.
             pose: (D+1, D+1) of the robot in the frame of the labels.
             scans: number of scans so far.
             frame: of the map.
@@ -194,7 +191,7 @@ class RobotFinder:
             if T is None:
                 return None
             odometry.enter(carried.join(labels, odometry.local_map, T), T)
-            frame.enter(carried.covariance)
+            frame.enter(_COVARIANCE)
             self._carried = None
             self._stretches[-1].last, self._stretches[-1].T = scans, T
             return T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local)

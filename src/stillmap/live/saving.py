@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import empty, iter_blocks, release_pages, write_npy
-from stillmap.core.errors import InputError, advise, cannot_write
+from stillmap.core.errors import advise, cannot_write
 from stillmap.core.files import require_new, resolve_output
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
@@ -95,19 +95,12 @@ class Snapshot(ShortRepr):
         """
         try:
             self._save(Path(path), overwrite, progress)
-        except (InputError, OSError) as error:
-            failure = cannot_write(error, path) if isinstance(error, OSError) else error
-            hints = [failure.hint, *([] if self.folder is None else [self._hint])]
-            hint = "; ".join(filter(None, hints))
-            raise InputError(failure.what, where=failure.where, hint=hint) from error
-        except BaseException:  # an interruption, or a defect: nobody drives the same way again
+        except BaseException as error:  # an interruption, too: nobody drives the same way again
             if self.folder is not None:
-                _log.warning(self._hint)
+                _log.warning("the drive is kept: stillmap map %s makes a map of it", self.folder)
+            if isinstance(error, OSError):
+                raise cannot_write(error, path) from error
             raise
-
-    @property
-    def _hint(self) -> str:
-        return f"the drive is kept: stillmap map {self.folder} makes a map of it"
 
     def _save(self, path: Path, overwrite: bool, progress: Progress) -> None:
         main, others = _find_submaps(self.placement)

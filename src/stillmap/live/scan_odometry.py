@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.front_end import Crowd, Registration
-from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, tend
+from stillmap.live.local_map import Labeller, LocalMap, MappedScan
 from stillmap.live.observation import select_hits, thin
 from stillmap.live.odometry_faults import OdometryFaults, is_plausible
 from stillmap.live.scan import ScanBeams, deskew
@@ -91,8 +91,8 @@ class ScanOdometry:
 
     def __init__(self, options: SlamOptions) -> None:
         self.options = options
-        self.local_map: MatchMap = LocalMap(options.resolution)
-        self.left_behind: MatchMap = self.local_map  # the one before the robot was carried
+        self.local_map = LocalMap(options.resolution)
+        self.left_behind = self.local_map  # the one before the robot was carried
         self.travelled = 0.0
         self.crowd = Crowd()
         self._pose, self._before = np.eye(3), np.eye(3)
@@ -188,10 +188,10 @@ class ScanOdometry:
         scan = MappedScan(beams, e, self._pose, self.travelled)
         added = self.local_map.add(replace(scan, e=recent))
         most = None if self._seconds >= _FAST else 0 if added else 1
-        tend(self.local_map, beams.stamp_ns, self.travelled, label, most)
+        self.local_map.tend(beams.stamp_ns, self.travelled, label, most)
         return scan if added else None
 
-    def enter(self, local_map: MatchMap, T: Float) -> None:
+    def enter(self, local_map: LocalMap, T: Float) -> None:
         """Go on in another map, in whose frame the frame so far has the pose T (3, 3)."""
         self.local_map = local_map
         self._pose, self._before = T @ self._pose, T @ self._before
@@ -199,7 +199,7 @@ class ScanOdometry:
         self._reckoning.reset()
         self._walls = None  # that map has the heading
 
-    def correct(self, local_map: MatchMap, motion: Float) -> None:
+    def correct(self, local_map: LocalMap, motion: Float) -> None:
         """Go on with a local map made anew, after the map has moved (3, 3)."""
         if self.left_behind is self.local_map:  # nothing was: its memory is free
             self.left_behind = local_map

@@ -11,6 +11,7 @@ from stillmap.live.global_localization import GlobalLocalizer, Localization
 from stillmap.live.known_cloud import KnownCloud, KnownPlanes, KnownVoxels
 from stillmap.live.known_map import KeptMap, KnownMap, overlay
 from stillmap.live.local_map import MappedScan
+from stillmap.live.place import Localizer
 from stillmap.live.sweep_view import SweepView, project_obstacles
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam import lidar_odometry
@@ -26,8 +27,8 @@ _GONE_WEIGHT = 1.0  # of a surface of the map where the view is free: a car may 
 _FEW_POINTS = 600  # of the last sweep, about, which are registered at every place that is proposed
 
 
-class SweepLocalizer:
-    """Searches a known map in 3D by what the robot saw since it was lost.
+class SweepLocalizer(Localizer):
+    """A known map in 3D, and the search in it by what the robot saw since it was lost.
 
     Args:
         known: the map.
@@ -37,10 +38,10 @@ class SweepLocalizer:
     """
 
     def __init__(self, known: KnownCloud, extends: bool, options: Options, threads: int) -> None:
+        super().__init__(known.planar, extends)
         output = options.output
         self._known, self._threads = known, threads
         self._band = output.min_obstacle_height, output.max_obstacle_height
-        self._extends = extends
         self._edge = resolve_resolution(options, 3).slam.resolution
         self._voxels = known.find_voxels(self._edge, self._band)
         self._planar = GlobalLocalizer(known.planar, gone_weight=_GONE_WEIGHT)
@@ -56,26 +57,26 @@ class SweepLocalizer:
 
     @property
     def route(self) -> Float:
-        """(T, 3) positions from where it was mapped, and extended before the robot was carried."""
+        """(T, 3) positions from where it was mapped, and extended before the robot was carried,
+        once the robot is found."""
+        return self._route[:0] if self.is_lost else self._route
+
+    @property
+    def _route(self) -> Float:
         return self._poses[:, :3, 3]
 
-    def forget(self, labels: CausalLabels, was_lost: bool) -> None:
-        """The robot was carried: the labels begin anew. A map that is extended is searched with
-        what they added, and they go on with it once the robot is found.
-
-        Args:
-            labels: of what was seen so far.
-            was_lost: of what was seen elsewhere.
-        """
+    def _forget(self, labels: CausalLabels) -> None:
+        """A map that is extended is searched with what the labels added, and they go on with it
+        once the robot is found."""
         self._begin_search()
         if not self._extends:
             labels.clear()
             return
-        if not was_lost:
+        if not self.is_lost:
             self._left = labels.filter
             self._poses = np.concatenate([self._known.poses, self._local_map.route])
             known, now = self._known.planar, labels.known_cells()
-            seen = project_obstacles(now, self.route, self._band, self._edge)
+            seen = project_obstacles(now, self._route, self._band, self._edge)
             extended = KnownMap(overlay(known.grid, seen))
             self._planar = GlobalLocalizer(extended, gone_weight=_GONE_WEIGHT)
         labels.filter = labels.filter.sibling()
@@ -84,38 +85,21 @@ class SweepLocalizer:
         """The map that sweeps are registered to: one and the same."""
         return self._local_map
 
-    def known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
-        """The filters of voxels with what the map knows.
-
-        Args:
-            empty: filters of the same kind.
-        """
+    def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
         if self._left is not None:
             return self._left
         assert isinstance(empty, _core.SweepFilter3D)
         self._voxels.prime(empty)
         return empty
 
-    def keep(self, labels: CausalLabels, is_lost: bool) -> KeptMap:
-        """The part of the map that an extended one keeps, as of now.
-
-        Args:
-            labels: of what was seen so far.
-            is_lost: they are of what was seen elsewhere.
-        """
-        if is_lost and self._left is None:  # it was never found
+    def keep(self, labels: CausalLabels) -> KeptMap:
+        """The part of the map that an extended one keeps, as of now; `labels`: so far."""
+        if self.is_lost and self._left is None:  # it was never found
             return self._known.keep(None, 1.0, self._edge, self._band)
-        now = labels.known_cells(self._left if is_lost else None)
+        now = labels.known_cells(self._left if self.is_lost else None)
         return self._known.keep(now, _p_unseen(labels), self._edge, self._band)
 
-    def localize(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> Localization:
-        """(4, 4) of the frame of the labels in the known map, if the evidence is clear.
-
-        Args:
-            labels: of what was seen since the robot was lost.
-            scan: the last sweep.
-            pose: (4, 4) of the robot in the frame of the labels.
-        """
+    def _search(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> Localization:
         beams, in_plane = scan.beams, se2.project_to_plane(pose[None])[0]
         dense, _ = lidar_odometry.make_sweep(
             beams.points, beams.hit, scan.e, None, beams.T_base_sensor
@@ -149,7 +133,7 @@ class SweepLocalizer:
 
     def _lift(self, in_plane: Float) -> Float:
         """(4, 4) a planar pose (3, 3), as high and inclined as the route where it is nearest."""
-        offset = in_plane[:2, 2] - self.route[:, :2]
+        offset = in_plane[:2, 2] - self._route[:, :2]
         nearest = int(np.argmin(np.square(offset).sum(axis=1)))
         up = self._poses[nearest, :3, 2]
         slope = -up[:2] / up[2]
@@ -157,7 +141,7 @@ class SweepLocalizer:
         x /= np.linalg.norm(x)
         T = np.eye(4)
         T[:3, :3] = np.column_stack([x, np.cross(up, x), up])
-        T[:3, 3] = [*in_plane[:2, 2], self.route[nearest, 2] + slope @ offset[nearest]]
+        T[:3, 3] = [*in_plane[:2, 2], self._route[nearest, 2] + slope @ offset[nearest]]
         return T
 
 

@@ -1,8 +1,11 @@
 """Planar maps of sweeps: obstacles above the ground, and what was seen of a place."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import unique_cells
 from stillmap.core.grid_map import GridMap
 from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
@@ -47,14 +50,21 @@ def project_obstacles(
     cells = known.cells[stands]
     ground = find_ground(known, positions, cell)
     obstacles = project_cells(known, ground, band, cell)
-    columns = np.concatenate([cells[:, :2], obstacles.cells])
-    first, last = columns.min(axis=0), columns.max(axis=0)
-    p_occupied = np.full((last - first + 1)[::-1], np.nan, np.float32)
-    for xy, p in ((cells[:, :2], 0.0), (obstacles.cells, obstacles.p_occupied)):
-        column, row = (xy - first).T
+    return _draw([(cells[:, :2], 0.0), (obstacles.cells, obstacles.p_occupied)], cell)
+
+
+def _draw(layers: list[tuple[Index, Any]], edge: float) -> GridMap:
+    """The map of (N, 2) cells with probabilities, later layers over earlier ones; NaN: unknown."""
+    every = np.concatenate([cells for cells, _ in layers])
+    if not len(every):
+        return empty_map(edge)
+    first = every.min(axis=0)
+    p_occupied = np.full((every.max(axis=0) + 1 - first)[::-1], np.nan, np.float32)
+    for cells, p in layers:
+        column, row = (cells - first).T
         p_occupied[row, column] = p
-    x, y = (first * cell).tolist()
-    return GridMap(p_occupied, (x, y, 0.0), cell)
+    x, y = (first * edge).tolist()
+    return GridMap(p_occupied, (x, y, 0.0), edge)
 
 
 def find_ground(known: CellProbabilities, positions: Float, cell: float) -> GroundMap:
@@ -100,7 +110,7 @@ class SweepView:
         ends = beams.points[near].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         free = _trace_low(T[:3, 3], ends, self._ground, _STEP * edge)
         cells = np.floor(free / edge).astype(np.int64)
-        self._free = _take_each_once(np.concatenate([self._free, cells]))
+        self._free = unique_cells(np.concatenate([self._free, cells]))[0]
 
     def draw(self, labels: CausalLabels) -> GridMap:
         """The view, in the frame of the labels; NaN: unknown."""
@@ -108,16 +118,7 @@ class SweepView:
         edge = labels.resolution
         near = self._select_near(labels.seen_cells(), edge)
         columns = project_cells(near, self._ground, self._band, edge)
-        both = np.concatenate([self._free, columns.cells])
-        if not len(both):
-            return GridMap(np.zeros((0, 0), np.float32), (0.0, 0.0, 0.0), edge)
-        first = both.min(axis=0)
-        p_occupied = np.full((both.max(axis=0) + 1 - first)[::-1], np.nan, np.float32)
-        for cells, p in ((self._free, np.float32(0.0)), (columns.cells, columns.p_occupied)):
-            x, y = (cells - first).T
-            p_occupied[y, x] = p
-        x0, y0 = (first * edge).tolist()
-        return GridMap(p_occupied, (x0, y0, 0.0), edge)
+        return _draw([(self._free, 0.0), (columns.cells, columns.p_occupied)], edge)
 
     def _select_near(self, seen: CellProbabilities, edge: float) -> CellProbabilities:
         from scipy import spatial  # slow to load
@@ -148,15 +149,4 @@ def _trace_low(start: Float, ends: Float, ground: GroundMap, step: float) -> Flo
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (first[of] + (number + 0.5) * step) / length[of]
     out: Float = start[:2] + share[:, None] * (ends[of, :2] - start[:2])
-    return out
-
-
-def _take_each_once(cells: Index) -> Index:
-    """(K, 2) of the cells (N, 2)."""
-    if not len(cells):
-        return cells
-    low = cells.min(axis=0)
-    width = int(cells[:, 1].max() - low[1]) + 1
-    flat = np.unique((cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1]))
-    out: Index = np.stack(np.divmod(flat, width), axis=1) + low
     return out

@@ -103,7 +103,7 @@ class _Search:
 
     def find_optima(self, heading: float) -> list[_Optimum]:
         """The best positions under a heading."""
-        rotated = self._offset @ _rotation(heading).T
+        rotated = self._offset @ se2.matrix(0.0, 0.0, heading)[:2, :2].T
         counts = _count(rotated / self.cell + self._half, (2 * self._half, 2 * self._half))
         field = self._rotate_field(heading)
         rfft2 = self._fft.rfft2
@@ -219,11 +219,6 @@ def _count(cells: NDArray[np.floating], shape: tuple[int, ...]) -> Raster:
     return counts.reshape(shape).astype(np.float32)
 
 
-def _rotation(heading: float) -> Float:
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s], [s, c]])
-
-
 _STEPS = (2.0, 1.0, 0.5)  # squares, by which an alignment is moved and turned
 _MAX_MOVES = 12  # of each length
 _BLUR = 1.0  # squares, std: so that a surface that lies nearer counts more
@@ -333,7 +328,8 @@ def propose_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Hypothesi
     if not found:
         return []
     refiner = MapRefiner(place, session)
-    refined = _sort([_compare(place, session, refiner.refine(T)) for T in found])
+    poses = [refiner.refine(T) for T in found]
+    refined = _sort([Hypothesis(T, compare_maps(place, session, T)) for T in poses])
     best = _distinct_hypotheses(refined, session)[:_MAX_HYPOTHESES]
     registration = _Registration(place, session)
     return _distinct_hypotheses(_sort([registration.refine(one) for one in best]), session)
@@ -366,13 +362,9 @@ class _Registration:
             max_candidates=1,
             T_start=start.T,
         )
-        found = _compare(self._place, self._session, T)
+        found = Hypothesis(T, compare_maps(self._place, self._session, T))
         kept = found.comparison.score >= _MIN_KEPT * start.comparison.score
         return found if kept else start
-
-
-def _compare(place: SurfaceMap, session: SurfaceMap, T: Float) -> Hypothesis:
-    return Hypothesis(T, compare_maps(place, session, T))
 
 
 def _sort(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
@@ -385,16 +377,12 @@ def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> l
     out = list[Hypothesis]()
     for one in hypotheses:
         distance = [float(np.linalg.norm((one.T - other.T) @ middle)) for other in out]
-        turn = [abs(_turn_between(one.T, other.T)) for other in out]
+        turn = [abs(se2.parameters(se2.inverse(one.T) @ other.T)[2]) for other in out]
         if not any(
             d < _RIVAL_DISTANCE and a < _RIVAL_ANGLE for d, a in zip(distance, turn, strict=True)
         ):
             out.append(one)
     return out
-
-
-def _turn_between(one: Float, other: Float) -> float:
-    return float(se2.parameters(se2.inverse(one) @ other)[2])
 
 
 def spread_evenly(count: int, max_chosen: int) -> list[int]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
-from stillmap.places.place_states import PlaceStates
+from stillmap.places.door_leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
+from stillmap.places.place_states import PlaceStates, are_near
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -86,94 +87,6 @@ def change_cells(
     return {"change": number, "xyz"[:D]: centres}
 
 
-# m: length of what is seen of a leaf, half its thickness with noise
-_LENGTH, _THICKNESS = (0.3, 1.6), 0.12
-# m: between what is seen of a leaf and its hinge or the latch, as cells beside walls are missing
-_END_GAP = 0.35
-_WIDTH = (0.6, 1.4)  # m, of the gap in the wall
-_POST = 0.2  # m of wall on either side of the gap, within _THICKNESS of its line
-_DIRECTIONS = 72  # of the line of a gap that are tried
-_STEP = 0.05  # m along a line
-_MAX_TURN_GAP = 0.45  # m between the ends at the hinge of two positions of a leaf
-_MAX_RATIO = 1.6  # of the lengths that are seen of two positions
-_MIN_TURN = 0.15  # rad between two positions
-
-
-class Leaf(NamedTuple):
-    """Ends (2, 2) and length of a leaf as it was observed, metres."""
-
-    ends: Float
-    length: float
-
-
-def fit_leaf(points: Float) -> Leaf | None:
-    """The straight leaf through points (n, 2) in metres; None: they are none."""
-    offset = points - points.mean(axis=0)
-    axis = np.linalg.eigh(offset.T @ offset)[1][:, 1]
-    along, across = offset @ axis, offset @ [-axis[1], axis[0]]
-    length = float(np.ptp(along))
-    if not _LENGTH[0] <= length <= _LENGTH[1] or float(np.abs(across).max()) > _THICKNESS:
-        return None
-    ends: Float = points.mean(axis=0) + np.outer([along.min(), along.max()], axis)
-    return Leaf(ends, length)
-
-
-def turn_about_hinge(one: Leaf, other: Leaf) -> bool:
-    """Whether two leaves are one in two positions: as long as each other, with a common end."""
-    apart = np.linalg.norm(one.ends[:, None] - other.ends[None], axis=2)
-    i, j = np.unravel_index(int(apart.argmin()), (2, 2))
-    u, v = one.ends[1 - i] - one.ends[i], other.ends[1 - j] - other.ends[j]
-    cosine = float(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)))
-    turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    lengths = sorted((one.length, other.length))
-    alike = lengths[1] <= _MAX_RATIO * lengths[0] + _MAX_TURN_GAP
-    return bool(apart[i, j] <= _MAX_TURN_GAP and alike and turned >= _MIN_TURN)
-
-
-def is_hinged(leaf: Leaf, wall: Float) -> bool:
-    """Whether a leaf ends where a wall does, beside a gap that it could shut.
-
-    Args:
-        leaf: what is seen of it.
-        wall: (n, 2) points of static surface around it, metres, without the leaf's own.
-    """
-    if leaf.length > _WIDTH[1] or not len(wall):
-        return False
-    angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
-    for end, other in (leaf.ends, leaf.ends[::-1]):
-        own = float(np.arctan2(*(other - end)[::-1]))
-        reach = np.linalg.norm(wall - end, axis=1)
-        if reach.min() > _END_GAP:
-            continue
-        near = wall[reach <= _WIDTH[1] + 2.0 * _END_GAP]
-        if any(_is_gap(end, angle, leaf.length, near) for angle in (own, *angles.tolist())):
-            return True
-    return False
-
-
-def _is_gap(end: Float, angle: float, length: float, wall: Float) -> bool:
-    """Whether a wall ends near a point and goes on in a direction, a leaf's width away."""
-    u = np.array([np.cos(angle), np.sin(angle)])
-    offset = wall - end
-    along, across = offset @ u, offset @ [-u[1], u[0]]
-    along = along[np.abs(across) <= _THICKNESS]
-    behind, ahead = along[along < length / 2.0], along[along >= length / 2.0]
-    if not len(behind) or not len(ahead):
-        return False
-    first, last = float(behind.max()), float(ahead.min())
-    width = last - first
-    if not (_WIDTH[0] <= width <= _WIDTH[1] and abs(first) <= _END_GAP and width >= length - 0.1):
-        return False
-    posts = (first - along[along <= first]), (along[along >= last] - last)
-    return all(_covers(post) for post in posts) and width <= length + 2.0 * _END_GAP
-
-
-def _covers(depth: Float) -> bool:
-    """Whether points at depths (n,) in a wall, metres, fill its first part."""
-    filled = np.unique(np.floor(depth[depth < _POST] / _STEP))
-    return len(filled) >= 0.75 * _POST / _STEP
-
-
 Cells = NDArray[np.int64]
 
 _MIN_PROBABILITY = 0.5  # that a cell changed
@@ -219,7 +132,8 @@ def detect_place_changes(place: PlaceStates) -> tuple[PlaceStates, list[PlaceCha
 def _find_groups(place: PlaceStates) -> list[_Events]:
     """Events of cells, grouped to objects that came or left between two sessions."""
     events, min_cells = _find_events(place), _MIN_CELLS[place.cells.shape[1]]
-    near = _near_static(place, place.cells[events.cell])
+    static = place.cells[place.states.p_static > _MIN_PROBABILITY]
+    near = are_near(place.cells[events.cell], static, _NOISE)
     apart, beside = (events.select(np.flatnonzero(mask)) for mask in (~near, near))
     out = []
     for group in _group_events(apart, place):
@@ -238,22 +152,12 @@ def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
     before, after = int(group.before.max()), int(group.after.min())
     like = (beside.came == group.came[0]) & (beside.before < after) & (beside.after > before)
     at = np.flatnonzero(like)
-    at = at[_within(place.cells[beside.cell[at]], place.cells[group.cell])]
+    at = at[are_near(place.cells[beside.cell[at]], place.cells[group.cell], _BESIDE)]
     first, last = beside.before[at], beside.after[at]
     at = max((at[(first <= s) & (last > s)] for s in range(before, after)), key=len)
     return _Events._make(
         np.concatenate([one, other[at]]) for one, other in zip(group, beside, strict=True)
     )
-
-
-def _within(cells: Cells, others: Cells) -> NDArray[np.bool_]:
-    """(n,) whether cells (n, D) lie right beside any of the others."""
-    if not len(cells) or not len(others):
-        return np.zeros(len(cells), np.bool_)
-    from scipy.spatial import cKDTree  # slow to load
-
-    distance, _ = cKDTree(others).query(cells, distance_upper_bound=_BESIDE + 1.0)
-    return np.asarray(distance <= _BESIDE)
 
 
 def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
@@ -274,7 +178,7 @@ def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
             continue
         low, high = place.cells[of].min(axis=0) - 3, place.cells[of].max(axis=0) + 3
         inside = np.flatnonzero(((place.cells >= low) & (place.cells <= high)).all(axis=1))
-        inside = inside[_within(place.cells[inside], place.cells[of])]
+        inside = inside[are_near(place.cells[inside], place.cells[of], _BESIDE)]
         of_each = np.where(is_static[inside, None], place.own[inside], place.evidence[inside])
         stood = (of_each[:, there] > _CLEAR).any(axis=1)
         seen_since = (of_each[:, gone] > _CLEAR).any(axis=1)
@@ -301,17 +205,6 @@ def _find_events(place: PlaceStates) -> _Events:
         last = np.where(observed[:, s], s, last)
     cell, came, before, after = (np.concatenate(column) for column in zip(*columns, strict=True))
     return _Events(cell.astype(np.intp), came.astype(np.bool_), before, after)
-
-
-def _near_static(place: PlaceStates, cells: Cells) -> NDArray[np.bool_]:
-    """(n,) whether cells (n, D) lie so near to static surface that noise explains them."""
-    static = place.cells[place.states.p_static > _MIN_PROBABILITY]
-    if not len(static) or not len(cells):
-        return np.zeros(len(cells), np.bool_)
-    from scipy.spatial import cKDTree  # slow to load
-
-    distance, _ = cKDTree(static).query(cells, distance_upper_bound=_NOISE + 1.0)
-    return np.asarray(distance <= _NOISE)
 
 
 def _group_events(events: _Events, place: PlaceStates) -> list[_Events]:

@@ -32,7 +32,7 @@ from stillmap.places.changes import (
 from stillmap.places.grow import estimate_planar
 from stillmap.places.keyframes import join_keyframes
 from stillmap.places.objects import write_objects
-from stillmap.places.place import Place, PlacedSession
+from stillmap.places.place import Place, PlacedSession, join_constraints
 from stillmap.places.place_map import (
     ShownState,
     changed_cell_table,
@@ -56,7 +56,6 @@ from stillmap.results.report.place import render_place_report
 from stillmap.results.run_json import quality_record
 from stillmap.results.timeline import CHANGES, STATES, PlaceSession
 from stillmap.slam import PoseGraph
-from stillmap.slam.pose_graph import Constraint
 
 Float = NDArray[np.float64]
 
@@ -291,27 +290,14 @@ def _write_place_files(folder: Path, result: PlaceResult) -> None:
 
 def _join_graphs(place: Place) -> PoseGraph:
     """The pose graph of all sessions; scans are numbered through all of them."""
-    keyframes, constraints, first_scan = [], list[Constraint](), 0
-    first_node = np.cumsum([0, *(len(one.nodes) for one in place.sessions)])
-    for k, one in enumerate(place.sessions):
-        graph, base = one.session.graph, int(first_node[k])
-        keyframes.append(graph.keyframes + first_scan)
-        constraints += [
-            Constraint(base + c.first, base + c.second, c.T, c.covariance)
-            for c in graph.constraints
-        ]
-        first_scan += len(one.session.stamp_ns)
-    constraints += [
-        Constraint(
-            int(first_node[tie.first]) + tie.first_node,
-            int(first_node[tie.second]) + tie.second_node,
-            tie.T,
-            tie.covariance,
-        )
-        for tie in place.ties
+    first_scan = np.cumsum([0, *(len(one.session.stamp_ns) for one in place.sessions)])
+    keyframes = [
+        one.session.graph.keyframes + first
+        for one, first in zip(place.sessions, first_scan, strict=False)
     ]
+    chain, loops = join_constraints([one.session for one in place.sessions], place.ties)
     nodes = np.concatenate([one.nodes for one in place.sessions])
-    return PoseGraph(np.concatenate(keyframes), nodes, constraints)
+    return PoseGraph(np.concatenate(keyframes), nodes, [*chain, *loops])
 
 
 def session_records(result: PlaceResult) -> list[dict[str, Any]]:

@@ -192,7 +192,7 @@ def _beats_rivals(
 
 def _unexplained_share(matches: Matches) -> float:
     """Mean share of a sweep that the submaps do not explain; 1 where few were matched."""
-    shares = [1.0 - match.explained for of in matches.values() for match in of]
+    shares = [1.0 - match.closure.explained for of in matches.values() for match in of]
     return float(np.mean(shares)) if len(shares) >= _MIN_TIES else 1.0
 
 
@@ -251,7 +251,7 @@ def _weigh(keyframes: Keyframes, poses: Float, states: PlaceStates | None) -> Ke
 def make_ties(matches: Matches, index: int) -> list[Tie]:
     """The constraints of keyframes that fit, between references and session `index`."""
     return [
-        Tie(reference, match.other, index, match.node, match.T, match.covariance)
+        Tie(reference, match.other, index, match.node, match.closure.T, match.closure.covariance)
         for reference, of in matches.items()
         for match in of
         if match.verdict is Verdict.FITS

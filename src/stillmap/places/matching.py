@@ -4,8 +4,8 @@ In the plane by the evidence that also verifies loops, in 3D sweep by sweep.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,27 +40,18 @@ class Verdict(Enum):
     UNKNOWN = "unknown"
 
 
-@dataclass(frozen=True, eq=False)
-class KeyframeMatch:
+class KeyframeMatch(NamedTuple):
     """A keyframe matched with a submap of another session.
 
     Attributes:
         node, other: indices into the nodes of the two sessions.
-        T: (D+1, D+1) pose of the keyframe in the frame of the other node.
-        covariance: see `LoopClosure`.
-        explained: share of its comparable beams that the submap explains.
-        comparable: share of its beams that the other session observed from the same side.
-        occluded: share of its beams that pass through surfaces of the other session.
+        closure: the measured pose of the keyframe in the frame of the other node.
         verdict: see Verdict.
     """
 
     node: int
     other: int
-    T: Float
-    covariance: Float
-    explained: float
-    comparable: float
-    occluded: float
+    closure: LoopClosure
     verdict: Verdict
 
 
@@ -161,16 +152,7 @@ def _judge(node: int, other: int, closure: LoopClosure, occluded: float) -> Keyf
             verdict = Verdict.CONTRADICTS
         elif not closure.rejected:
             verdict = Verdict.FITS
-    return KeyframeMatch(
-        node,
-        other,
-        closure.T,
-        closure.covariance,
-        closure.explained,
-        closure.comparable,
-        occluded,
-        verdict,
-    )
+    return KeyframeMatch(node, other, closure, verdict)
 
 
 _REACH = 20.0  # m between a node and the one of the other session whose submap it is matched with
@@ -217,16 +199,6 @@ def match_sweeps(
             continue
         earlier = int(one.nodes[nearest])
         closure = closer.verify(earlier, later, se2.inverse(poses[earlier]) @ poses[later], *std)
-        out.append(
-            KeyframeMatch(
-                node,
-                nearest,
-                closure.T,
-                closure.covariance,
-                closure.explained,
-                1.0,
-                0.0,
-                Verdict.CONTRADICTS if closure.rejected else Verdict.FITS,
-            )
-        )
+        verdict = Verdict.CONTRADICTS if closure.rejected else Verdict.FITS
+        out.append(KeyframeMatch(node, nearest, closure, verdict))
     return out

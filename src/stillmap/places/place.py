@@ -41,6 +41,28 @@ class Tie(ShortRepr):
     covariance: Float
 
 
+def join_constraints(
+    sessions: Sequence[Session], ties: Sequence[Tie]
+) -> tuple[list[Constraint], list[Constraint]]:
+    """The constraints of all sessions, and those between them, of nodes numbered through."""
+    first = np.cumsum([0, *(len(session.graph.keyframes) for session in sessions)]).tolist()
+    chain = [
+        Constraint(k + c.first, k + c.second, c.T, c.covariance)
+        for k, session in zip(first, sessions, strict=False)
+        for c in session.graph.constraints
+    ]
+    loops = [
+        Constraint(
+            first[tie.first] + tie.first_node,
+            first[tie.second] + tie.second_node,
+            tie.T,
+            tie.covariance,
+        )
+        for tie in ties
+    ]
+    return chain, loops
+
+
 def optimize_nodes(
     sessions: Sequence[Session], start: Sequence[Float], ties: Sequence[Tie]
 ) -> tuple[list[Float], NDArray[np.bool_]]:
@@ -54,28 +76,15 @@ def optimize_nodes(
     Returns:
         the poses, and which ties (L,) agree with them.
     """
-    first = np.cumsum([0, *(len(nodes) for nodes in start)])
-    chain = [
-        Constraint(int(k + c.first), int(k + c.second), c.T, c.covariance)
-        for k, session in zip(first, sessions, strict=False)
-        for c in session.graph.constraints
-    ]
-    loops = [
-        Constraint(
-            int(first[tie.first] + tie.first_node),
-            int(first[tie.second] + tie.second_node),
-            tie.T,
-            tie.covariance,
-        )
-        for tie in ties
-    ]
+    chain, loops = join_constraints(sessions, ties)
     max_chi2 = MAX_CHI2[sessions[0].dimension]
     everything = np.concatenate(start)
     found = pose_graph.optimize_poses(everything, chain, loops, max_chi2)
     agree = pose_graph.squared_mahalanobis(found, loops) <= max_chi2
     kept = [loop for loop, agrees in zip(loops, agree.tolist(), strict=True) if agrees]
     found = pose_graph.optimize_poses(found, chain, kept)
-    return np.split(found, first[1:-1]), agree
+    ends = np.cumsum([len(nodes) for nodes in start])
+    return np.split(found, ends[:-1]), agree
 
 
 def place_scans(session: Session, T: Float, nodes: Float) -> Float:

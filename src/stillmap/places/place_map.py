@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from stillmap.core.tiles import TILE, TiledArray, compact, crop
 from stillmap.em import OccupancyMap
 from stillmap.places.changes import PlaceChange
 from stillmap.places.evidence import BeamCells, Evidence, to_sums
-from stillmap.places.place_states import MIN_HITS, PlaceStates, Tile, iter_tiles
+from stillmap.places.place_states import MIN_HITS, PlaceStates, Tile, are_near, iter_tiles
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -106,13 +106,8 @@ def _settle_unlisted(place: PlaceStates, changes: list[PlaceChange]) -> tuple[In
         listed[change.cells] = True
     alone = np.flatnonzero((place.states.p_changing > 0.5) & ~listed)
     static = place.cells[place.states.p_static > 0.5]
-    if not len(alone) or not len(static):
-        return np.zeros(0, np.intp), alone
-    from scipy.spatial import cKDTree  # slow to load
-
-    limit = _STATIC_DISTANCE
-    distance, _ = cKDTree(static).query(place.cells[alone], distance_upper_bound=limit + 1.0)
-    return alone[distance <= limit], alone[distance > limit]
+    near = are_near(place.cells[alone], static, _STATIC_DISTANCE)
+    return alone[near], alone[~near]
 
 
 def label_session(
@@ -203,13 +198,8 @@ def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> Occupancy
     block = slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
     resolution = sessions[0].resolution
     x, y = ((low + first) * resolution).tolist()
-    p_occupied, alpha, beta = (_crop(layer, block) for layer in layers)
+    p_occupied, alpha, beta = (crop(compact(layer), block) for layer in layers)
     return OccupancyMap(p_occupied, (x, y, 0.0), resolution, alpha, beta)
-
-
-def _crop(layer: TiledArray, block: tuple[slice, slice]) -> Any:
-    """The part of a layer as an array."""
-    return crop(compact(layer), block)
 
 
 def _split_by_tile(

@@ -286,6 +286,16 @@ class PlaceStates(ShortRepr):
         return replace(self, evidence=evidence, states=CellStates(**columns))
 
 
+def are_near(cells: Cells, others: Cells, distance: float) -> NDArray[np.bool_]:
+    """(n,) True for cells (n, D) at most so many cells away from any of the others."""
+    if not len(cells) or not len(others):
+        return np.zeros(len(cells), np.bool_)
+    from scipy.spatial import cKDTree  # slow to load
+
+    nearest, _ = cKDTree(others).query(cells, distance_upper_bound=distance + 1.0)
+    return np.asarray(nearest <= distance)
+
+
 def measure_overlap(sessions: Sequence[Evidence], index: int) -> float:
     """Share of the hits of a session in cells that another one observed."""
     known = total = 0

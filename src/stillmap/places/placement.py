@@ -184,8 +184,10 @@ def placement_std(placement: Placement, session: Session) -> tuple[float, float]
     """
     fits = [m for of in placement.matches.values() for m in of if m.verdict is Verdict.FITS]
     poses = session.planar.poses[session.planar.nodes[[m.node for m in fits]]]
-    origin = _translation(poses[:, :2, 2].mean(axis=0))
-    covariance = _combine(se2.inverse(origin) @ poses, [match.covariance for match in fits])
+    x, y = poses[:, :2, 2].mean(axis=0).tolist()
+    covariance = _combine(
+        se2.inverse(se2.matrix(x, y, 0.0)) @ poses, [match.closure.covariance for match in fits]
+    )
     return (
         float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])),
         float(np.sqrt(covariance[2, 2])),
@@ -220,7 +222,3 @@ def _alignment_jacobian(pose: Float) -> Float:
     J = np.eye(3)
     J[:2, :2], J[:2, 2] = R, R @ [-y, x]
     return J
-
-
-def _translation(xy: Float) -> Float:
-    return se2.matrix(float(xy[0]), float(xy[1]), 0.0)

@@ -23,7 +23,7 @@ from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.evidence import BLOCK, BeamCells, Evidence
 from stillmap.places.keyframes import Keyframes, Session
-from stillmap.places.place import Place, PlacedSession, Tie, to_planar
+from stillmap.places.place import Place, PlacedSession, Tie
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 from stillmap.results.reader import RECORD, SESSIONS, RunRecord, read_labels, read_run, read_tracks
 from stillmap.results.timeline import HINT, PlaceSession, read_sessions
@@ -170,10 +170,9 @@ def _read_placed(home: Path, record: PlaceSession, voxel_size: float) -> PlacedS
     covariance = np.array(read_array(state / "covariance.npy", (3 * (D - 1),) * 2, np.float64))
     if not np.isfinite(covariance).all():
         raise InputError("is not finite", where=str(state / "covariance.npy"), hint=HINT)
-    evidence = planar = _read_evidence(state / "evidence.npz", session.keyframes, measured_at)
+    evidence = planar = _read_evidence(state / "evidence.npz", D)
     if D == 3:
-        at = to_planar(session, measured_at)
-        planar = _read_evidence(state / "planar_evidence.npz", session.planar, at)
+        planar = _read_evidence(state / "planar_evidence.npz", 2)
     return PlacedSession(session, nodes, covariance, record.overlap, evidence, planar, measured_at)
 
 
@@ -264,33 +263,17 @@ def _check_beam_cells(home: Path, beams: BeamCells, session: Session) -> None:
                 raise _inconsistent(home / STATE)
 
 
-def _read_evidence(path: Path, keyframes: Keyframes, poses: Float) -> Evidence:
-    """The evidence of keyframes that lay at poses (K, D+1, D+1) when it was measured."""
-    D = poses.shape[-1] - 1
+def _read_evidence(path: Path, D: int) -> Evidence:
     corner, hits, passes, resolution = read_npz(
         path, ("corner", "hits", "passes", "resolution"), _MAX_ARRAY, HINT
     ).values()
     shape = (len(corner), *(BLOCK[D],) * D)
     fits = corner.shape == (len(corner), D) and hits.shape == shape and passes.shape == shape
     kinds = corner.dtype == np.int32 and hits.dtype == np.uint8 and passes.dtype == np.uint8
-    if not (fits and kinds and resolution.shape == () and 0.0 < float(resolution) < 100.0):
+    is_usable = fits and kinds and resolution.shape == () and 0.0 < float(resolution) < 100.0
+    if not is_usable or np.any(corner % BLOCK[D]):
         raise InputError("is damaged", where=str(path), hint=HINT)
-    low = corner.min(axis=0, initial=0) * float(resolution)
-    high = (corner.max(axis=0, initial=0) + BLOCK[D]) * float(resolution)
-    if np.any(corner % BLOCK[D]) or not _end_within(keyframes, poses, low, high):
-        raise InputError("is not that of the keyframes", where=str(path), hint=HINT)
     return Evidence(corner, hits, passes, float(resolution))
-
-
-def _end_within(keyframes: Keyframes, poses: Float, low: Float, high: Float) -> bool:
-    """Whether all beams that hit something end in a box of corners (D,), metres."""
-    recording = keyframes.recording
-    for block in arrays.iter_blocks(recording.hit):
-        beams = block.start + np.flatnonzero(recording.hit[block])
-        ends = recording.end_points(beams, poses)
-        if ((ends < low) | (ends > high)).any():
-            return False
-    return True
 
 
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
