@@ -60,7 +60,10 @@ def search_alignments(
     headings = np.arange(search.headings) * (2.0 * np.pi / search.headings)
     found = [one for heading in headings.tolist() for one in search.find_optima(heading)]
     found.sort(key=lambda one: -one.score)
-    return [search.to_alignment(one) for one in _remove_duplicates(found, search)]
+    return [
+        _to_alignment(search.middle, one.x, one.y, one.heading)
+        for one in _remove_duplicates(found, search)
+    ]
 
 
 class _Search:
@@ -75,10 +78,9 @@ class _Search:
         self._place, self._session = place, session
         self.middle = middle_of(session)
         offset = session.surface - self.middle
-        spread = float(np.sqrt(np.square(offset).sum(axis=1).mean()))
         squares, self._half = self._choose_cells()
         self.cell = squares * place.edge
-        turns = 2.0 * np.pi * spread / (_TURN_CELLS * self.cell)
+        turns = 2.0 * np.pi * _spread(offset) / (_TURN_CELLS * self.cell)
         self.headings = int(np.clip(np.ceil(turns), *_HEADINGS))
         self._offset = offset
         field = _pool(_make_field(place, squares, free_weight), squares)
@@ -138,11 +140,16 @@ class _Search:
         out: Raster = self._field.ravel().take(rows)
         return out
 
-    def to_alignment(self, one: _Optimum) -> Float:
-        """T_place_session (3, 3)."""
-        back = se2.matrix(-self.middle[0], -self.middle[1], 0.0)
-        out: Float = se2.matrix(one.x, one.y, one.heading) @ back
-        return out
+
+def _to_alignment(middle: Float, x: float, y: float, heading: float) -> Float:
+    """T_place_session (3, 3) with the middle of the session at x, y and its heading."""
+    back = se2.matrix(-middle[0], -middle[1], 0.0)
+    return np.asarray(se2.matrix(x, y, heading) @ back)
+
+
+def _spread(offset: Float) -> float:
+    """m, root mean square of offsets (N, 2)."""
+    return float(np.sqrt(np.square(offset).sum(axis=1).mean()))
 
 
 def _find_maxima(score: Raster, most: int) -> NDArray[np.intp]:
@@ -166,8 +173,7 @@ def _find_maxima(score: Raster, most: int) -> NDArray[np.intp]:
 
 def middle_of(session: SurfaceMap) -> Float:
     """(2,) mean of the surfaces, m."""
-    out: Float = session.surface.mean(axis=0, dtype=np.float64)
-    return out
+    return np.asarray(session.surface.mean(axis=0, dtype=np.float64))
 
 
 def _remove_duplicates(found: list[_Optimum], search: _Search) -> list[_Optimum]:
@@ -241,8 +247,7 @@ class MapRefiner:
     def __init__(self, place: SurfaceMap, session: SurfaceMap) -> None:
         self._place, self._session = _make_layer(place), _make_layer(session)
         self._edge, self._middle = place.edge, middle_of(session)
-        offset = session.surface - self._middle
-        self._spread = max(float(np.sqrt(np.square(offset).sum(axis=1).mean())), place.edge)
+        self._spread = max(_spread(session.surface - self._middle), place.edge)
 
     def refine(self, T: Float) -> Float:
         """T_place_session (3, 3) of the optimum that steps of falling length reach."""
@@ -258,16 +263,11 @@ class MapRefiner:
                 if scores[k] <= best:
                     break
                 x, best = tried[k], scores[k]
-        return self._to_alignment(x)
-
-    def _to_alignment(self, x: Float) -> Float:
-        back = se2.matrix(-self._middle[0], -self._middle[1], 0.0)
-        out: Float = se2.matrix(float(x[0]), float(x[1]), float(x[2])) @ back
-        return out
+        return _to_alignment(self._middle, *x.tolist())
 
     def _score(self, x: Float) -> float:
         """Evidence of both maps with the session's middle at x, y and its heading."""
-        T = self._to_alignment(x)
+        T = _to_alignment(self._middle, *x.tolist())
         return self._look_up(self._place, self._session, T) + self._look_up(
             self._session, self._place, se2.inverse(T)
         )
@@ -329,10 +329,10 @@ def propose_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Hypothesi
         return []
     refiner = MapRefiner(place, session)
     poses = [refiner.refine(T) for T in found]
-    refined = _sort([Hypothesis(T, compare_maps(place, session, T)) for T in poses])
+    refined = [Hypothesis(T, compare_maps(place, session, T)) for T in poses]
     best = _distinct_hypotheses(refined, session)[:_MAX_HYPOTHESES]
     registration = _Registration(place, session)
-    return _distinct_hypotheses(_sort([registration.refine(one) for one in best]), session)
+    return _distinct_hypotheses([registration.refine(one) for one in best], session)
 
 
 class _Registration:
@@ -367,15 +367,11 @@ class _Registration:
         return found if kept else start
 
 
-def _sort(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-    return sorted(hypotheses, key=lambda one: -one.comparison.score)
-
-
 def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> list[Hypothesis]:
-    """Those that put the session elsewhere than all better ones."""
+    """Those that put the session elsewhere than all better ones, the best first."""
     middle = np.append(middle_of(session), 1.0)
     out = list[Hypothesis]()
-    for one in hypotheses:
+    for one in sorted(hypotheses, key=lambda hypothesis: -hypothesis.comparison.score):
         distance = [float(np.linalg.norm((one.T - other.T) @ middle)) for other in out]
         turn = [abs(se2.parameters(se2.inverse(one.T) @ other.T)[2]) for other in out]
         if not any(
