@@ -130,8 +130,7 @@ def _find_indispensable(
     at = np.searchsorted(keyframes, np.array(ends, np.intp).reshape(-1, 2))
     recent = travelled > travelled[-1] - _RECENT
     of_recent = of[at[recent[at[:, 1]]]]
-    out: Mask = recent | np.isin(of, of_recent) | ~np.isin(of, of[at])
-    return out
+    return np.asarray(recent | np.isin(of, of_recent) | ~np.isin(of, of[at]))
 
 
 def _find_standing(poses: Float, keyframes: Index) -> Mask:

@@ -326,8 +326,7 @@ def _to_matrix(odometry: ArrayLike | None, dimension: int) -> Float | None:
     if odometry is None:
         return None
     given = np.asarray(odometry, np.float64)[None]
-    out: Float = poses_to_matrices("odometry", given, 1, dimension)[0]
-    return out
+    return np.asarray(poses_to_matrices("odometry", given, 1, dimension)[0])
 
 
 def _adopt_resolution(options: Options, known: KnownMap, dimension: int) -> Options:

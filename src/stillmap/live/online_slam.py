@@ -318,8 +318,7 @@ class OnlineSlam:
         """(D+1, D+1) of odometry since the last scan; None: not known."""
         if T_odom_base is None or self._T_odom_base is None:
             return None
-        out: Float = se2.inverse(self._T_odom_base) @ T_odom_base
-        return out
+        return np.asarray(se2.inverse(self._T_odom_base) @ T_odom_base)
 
     def _to_map_odom(self, pose: Float) -> Float | None:
         """(D+1, D+1) T_map_odom at the pose of the last scan; None: without odometry."""

@@ -66,8 +66,7 @@ class Relocalizer:
         self.is_ambiguous = found.is_ambiguous
         if found.T is None:
             return None
-        out: Float = se2.inverse(self._T_map_local) @ found.T @ self._T_map_local
-        return out
+        return np.asarray(se2.inverse(self._T_map_local) @ found.T @ self._T_map_local)
 
     def join(self, labels: CausalLabels, local_map: LocalMap, T: Float) -> LocalMap:
         """The map of before with what was seen since, moved by T (3, 3) of `localize`: the labels

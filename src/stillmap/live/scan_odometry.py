@@ -75,8 +75,7 @@ class WallDirections:
 def correct_heading(T: Float, covariance: Float, offset: HeadingOffset) -> Float:
     """A pose (3, 3) with covariance (3, 3) after a Kalman update by its heading's offset."""
     gain = covariance[:, 2] / (covariance[2, 2] + offset.variance)
-    out: Float = se2.matrix(*(se2.parameters(T) + offset.value * gain))
-    return out
+    return np.asarray(se2.matrix(*(se2.parameters(T) + offset.value * gain)))
 
 
 class ScanOdometry:

@@ -148,5 +148,4 @@ def _trace_low(start: Float, ends: Float, ground: GroundMap, step: float) -> Flo
     of = np.repeat(np.arange(len(ends)), counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (first[of] + (number + 0.5) * step) / length[of]
-    out: Float = start[:2] + share[:, None] * (ends[of, :2] - start[:2])
-    return out
+    return np.asarray(start[:2] + share[:, None] * (ends[of, :2] - start[:2]))

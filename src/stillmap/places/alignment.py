@@ -137,8 +137,7 @@ class _Search:
         np.clip(columns, 0, width - 1, out=columns)
         rows *= width
         rows += columns
-        out: Raster = self._field.ravel().take(rows)
-        return out
+        return np.asarray(self._field.ravel().take(rows))
 
 
 def _to_alignment(middle: Float, x: float, y: float, heading: float) -> Float:
@@ -167,8 +166,7 @@ def _find_maxima(score: Raster, most: int) -> NDArray[np.intp]:
         found = at[values[at] >= values[near].max(axis=(1, 2))]
         if len(found) >= most or limit <= 0.0:
             break
-    out: NDArray[np.intp] = found[np.argsort(-values[found], kind="stable")[:most]]
-    return out
+    return np.asarray(found[np.argsort(-values[found], kind="stable")[:most]])
 
 
 def middle_of(session: SurfaceMap) -> Float:
@@ -206,16 +204,14 @@ def _make_field(known: SurfaceMap, squares: int, free_weight: float) -> Raster:
         near = ndimage.binary_dilation(near, around, steps)
         free = ndimage.binary_erosion(free, around, steps)
     blocked = (free & ~near).astype(np.float32)
-    out: Raster = near.astype(np.float32) - np.float32(free_weight) * blocked
-    return out
+    return np.asarray(near.astype(np.float32) - np.float32(free_weight) * blocked)
 
 
 def _pool(field: Raster, squares: int) -> Raster:
     """Means over cells of so many squares along each edge."""
     padded = np.pad(field, [(0, -n % squares) for n in field.shape])
     X, Y = (n // squares for n in padded.shape)
-    out: Raster = padded.reshape(X, squares, Y, squares).mean(axis=(1, 3))
-    return out
+    return np.asarray(padded.reshape(X, squares, Y, squares).mean(axis=(1, 3)))
 
 
 def _count(cells: NDArray[np.floating], shape: tuple[int, ...]) -> Raster:

@@ -82,8 +82,7 @@ def _tilt(at: Float, rise: Float) -> Float:
     back[:3, 3] = -centre
     # a rotation vector (slope_y, -slope_x, 0) raises a point by its offset times the slope
     turn = se3.exp(np.array([0.0, 0.0, height, slope[1], -slope[0], 0.0]))
-    out: Float = to_centre @ turn @ back
-    return out
+    return np.asarray(to_centre @ turn @ back)
 
 
 Matches = dict[int, list[KeyframeMatch]]  # by the index of the reference in the place

@@ -146,8 +146,7 @@ class PlacedSession(ShortRepr):
     @property
     def T(self) -> Float:
         """(D+1, D+1) T_place_session, where the first scan is."""
-        out: Float = self.nodes[0] @ se2.inverse(self.session.node_poses[0])
-        return out
+        return np.asarray(self.nodes[0] @ se2.inverse(self.session.node_poses[0]))
 
     def between_maps(self, T: Float, frame: LocalFrame) -> Float:
         """A transform (D+1, D+1) from the session's frame to that of the place, from the map frame

@@ -124,8 +124,7 @@ def _pool(
         [of + np.bincount(i, of[j], minlength=len(log)) for of in np.maximum(log, -_MAX_POOLED).T],
         axis=1,
     )
-    out: Float = total * (np.minimum(count, _INDEPENDENT_CELLS) / count)[:, None]
-    return out
+    return np.asarray(total * (np.minimum(count, _INDEPENDENT_CELLS) / count)[:, None])
 
 
 def _log_likelihoods(evidence: Float, log_chain: Float) -> Float:
@@ -177,8 +176,7 @@ def _forward(evidence: Float) -> tuple[Float, Float]:
 
 def _ratios(evidence: Float) -> Float:
     """(S, K) likelihood ratios; session by session, as the chain goes through them."""
-    out: Float = np.exp(np.ascontiguousarray(evidence.T))
-    return out
+    return np.asarray(np.exp(np.ascontiguousarray(evidence.T)))
 
 
 def _smooth(evidence: Float, p: Float) -> Float:

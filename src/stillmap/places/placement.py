@@ -210,8 +210,7 @@ def _combine(poses: Float, covariances: Sequence[Float]) -> Float:
     for pose, covariance in zip(poses, covariances, strict=True):
         J = _alignment_jacobian(pose)
         information = information + _INDEPENDENT * J.T @ np.linalg.solve(covariance, J)
-    out: Float = np.linalg.inv(information).astype(np.float64)
-    return out
+    return np.asarray(np.linalg.inv(information).astype(np.float64))
 
 
 def _alignment_jacobian(pose: Float) -> Float:

@@ -97,8 +97,7 @@ class SurfaceMap(ShortRepr):
         return np.asarray(self.side[x, y], np.float64)
 
     def _squares_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        out: NDArray[np.int64] = np.floor(points / self.edge).astype(np.int64) - self.low
-        return out
+        return np.asarray(np.floor(points / self.edge).astype(np.int64) - self.low)
 
 
 def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> SurfaceMap:
@@ -164,8 +163,7 @@ def find_sides(passed: NDArray[np.bool_]) -> NDArray[np.float32]:
 def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
     """Reduces squares of cells (X, Y) to one number each."""
     rows = reduce.reduce([cells[k::_STEP] for k in range(_STEP)])
-    out: Bytes = reduce.reduce([rows[:, k::_STEP] for k in range(_STEP)])
-    return out
+    return np.asarray(reduce.reduce([rows[:, k::_STEP] for k in range(_STEP)]))
 
 
 def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> Comparison:
@@ -199,5 +197,4 @@ def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float
 
 
 def _transform(T: Float, points: NDArray[np.float32]) -> Float:
-    out: Float = points @ T[:2, :2].T + T[:2, 2]
-    return out
+    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
