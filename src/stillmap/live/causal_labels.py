@@ -201,10 +201,10 @@ class CausalLabels:
         """Radians between the beams of a sensor, as of its first sweep that met anything."""
         if beams.sensor in self._pixels:
             return self._pixels[beams.sensor]
-        found = find_pixel_size(beams.points, beams.hit)
+        size = find_pixel_size(beams.points, beams.hit)
         if beams.hit.any():
-            self._pixels[beams.sensor] = found
-        return found
+            self._pixels[beams.sensor] = size
+        return size
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""

@@ -113,20 +113,24 @@ class GlobalLocalizer:
         session = to_surface_map(view)
         if len(session.surface) < _MIN_SURFACE:
             return Localization(None)
-        found = list[_Alignment]()
+        alignments = list[_Alignment]()
         proposed = search_alignments(self._surface, session, _FREE_WEIGHT, self._gone_weight)
         for T in proposed[:_MAX_CANDIDATES]:
-            found.append(self._weigh(session, refine(T)))
-        return self._choose(sorted(found, key=lambda one: -one.evidence), session)
+            alignments.append(self._weigh(session, refine(T)))
+        return self._choose(sorted(alignments, key=lambda alignment: -alignment.evidence), session)
 
-    def _choose(self, found: list[_Alignment], session: SurfaceMap) -> Localization:
+    def _choose(self, alignments: list[_Alignment], session: SurfaceMap) -> Localization:
         """The best alignment, if the evidence is clear."""
         last, self._last = self._last, None
         squares = len(session.surface)
-        if not found or found[0].agree < self._min_agree * squares or found[0].evidence <= 0.0:
+        if (
+            not alignments
+            or alignments[0].agree < self._min_agree * squares
+            or alignments[0].evidence <= 0.0
+        ):
             return Localization(None)
-        best = found[0]
-        rivals = [one.evidence for one in found[1:] if _is_apart(best.T, one.T)]
+        best = alignments[0]
+        rivals = [rival.evidence for rival in alignments[1:] if _is_apart(best.T, rival.T)]
         share = max(rivals, default=0.0) / best.evidence
         if share > max(_MAX_RIVAL.values()):
             return Localization(None, is_ambiguous=True)
@@ -147,9 +151,9 @@ class GlobalLocalizer:
         fresh = ~self._first.is_near(session.surface)
         T = np.asarray(T)
         points = session.surface[fresh] @ T[:2, :2].T + T[:2, 2]
-        found = self._surface.look_up(points, session.surface_sides[fresh] @ T[:2, :2].T)
+        shown = self._surface.look_up(points, session.surface_sides[fresh] @ T[:2, :2].T)
         count = int(fresh.sum())
-        return count >= _MIN_FRESH and found.agree >= _MIN_FRESH_AGREE * count
+        return count >= _MIN_FRESH and shown.agree >= _MIN_FRESH_AGREE * count
 
     def _weigh(self, session: SurfaceMap, T: Float) -> _Alignment:
         forth, back = compare_surfaces(self._surface, session, T)
@@ -167,6 +171,6 @@ class GlobalLocalizer:
         return scan_matching.search_pose(self._grid, scan, prior, *window).T_map_base
 
 
-def _is_apart(one: Float, other: Float) -> bool:
-    x, y, theta = se2.parameters(se2.inverse(one) @ other)
+def _is_apart(first: Float, second: Float) -> bool:
+    x, y, theta = se2.parameters(se2.inverse(first) @ second)
     return bool(np.hypot(x, y) > _APART[0] or abs(theta) > _APART[1])

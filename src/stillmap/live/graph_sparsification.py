@@ -79,8 +79,8 @@ def select_scans(view: SpacedView, keyframes: Index, state: LoopState) -> Mask:
     stretch = (view.travelled // SUBMAP_TRAVEL).astype(np.int64)
     travelled, of = view.travelled[keyframes], stretch[keyframes]
     near = [
-        others[np.abs(travelled[others] - travelled[k]) > MIN_LOOP_TRAVEL]
-        for k, others in enumerate(_iter_near(state.poses))
+        alike[np.abs(travelled[alike] - travelled[k]) > MIN_LOOP_TRAVEL]
+        for k, alike in enumerate(_iter_near(state.poses))
     ]
     stay = _find_first(of, near) | _find_indispensable(travelled, of, keyframes, state.fitting)
     stay |= _find_latest(of, near, stay)
@@ -103,8 +103,8 @@ def _iter_near(poses: Float) -> Iterator[Index]:
 def _find_first(of: Index, near: Sequence[Index]) -> Mask:
     """(K,) keyframes of stretches in which a place was seen for the first time."""
     stay = np.zeros(len(of), np.bool_)
-    for one in np.unique(of):
-        members = np.flatnonzero(of == one).tolist()
+    for stretch in np.unique(of):
+        members = np.flatnonzero(of == stretch).tolist()
         if any(not stay[near[k]].any() for k in members):
             stay[members] = True
     return stay
@@ -113,8 +113,8 @@ def _find_first(of: Index, near: Sequence[Index]) -> Mask:
 def _find_latest(of: Index, near: Sequence[Index], stay: Mask) -> Mask:
     """(K,) keyframes of the latest stretches at each place; `stay`: those that stay anyhow."""
     latest = np.zeros(len(of), np.bool_)
-    for one in np.unique(of)[::-1]:
-        members = np.flatnonzero(of == one).tolist()
+    for stretch in np.unique(of)[::-1]:
+        members = np.flatnonzero(of == stretch).tolist()
         is_needed = (len(np.unique(of[near[k][latest[near[k]]]])) < _LATEST for k in members)
         if stay[members].any() or any(is_needed):
             latest[members] = True
@@ -144,14 +144,14 @@ def _find_standing(poses: Float, keyframes: Index) -> Mask:
 
 def find_nearest(poses: Float, among: Float) -> Index:
     """(n,) the nearest ones among poses (K, 3, 3) of poses (n, 3, 3), by m and rad."""
-    x, others = se2.parameters(poses), se2.parameters(among)
-    found = np.zeros(len(x), np.intp)
+    x, known = se2.parameters(poses), se2.parameters(among)
+    nearest = np.zeros(len(x), np.intp)
     for first in range(0, len(x), _ROWS):
         rows = x[first : first + _ROWS, None]
-        away = np.hypot(rows[..., 0] - others[:, 0], rows[..., 1] - others[:, 1])
-        turn = np.abs(se2.wrap(rows[..., 2] - others[:, 2]))
-        found[first : first + _ROWS] = np.argmin(away + turn, axis=1)
-    return found
+        away = np.hypot(rows[..., 0] - known[:, 0], rows[..., 1] - known[:, 1])
+        turn = np.abs(se2.wrap(rows[..., 2] - known[:, 2]))
+        nearest[first : first + _ROWS] = np.argmin(away + turn, axis=1)
+    return nearest
 
 
 def select_state(state: LoopState, keyframes: Index, stay: Mask) -> LoopState:
@@ -167,7 +167,7 @@ def select_state(state: LoopState, keyframes: Index, stay: Mask) -> LoopState:
     at = np.flatnonzero(stay[keyframes])
     number = np.cumsum(stay) - 1  # of each scan from now on
     is_fitting = set(map(id, state.fitting))
-    attempted, found, fitting = [], [], []
+    attempted, decided_on, fitting = [], [], []
     for attempt, decided in zip(state.attempted, state.found, strict=True):
         moved = _move_closure(decided, state.poses, keyframes, at)
         if moved is None or not stay[decided.later]:
@@ -175,11 +175,11 @@ def select_state(state: LoopState, keyframes: Index, stay: Mask) -> LoopState:
         new = dataclasses.replace(
             moved, earlier=int(number[moved.earlier]), later=int(number[moved.later])
         )
-        found.append(new)
+        decided_on.append(new)
         attempted.append(dataclasses.replace(new, rejected=attempt.rejected))
         if id(decided) in is_fitting:
             fitting.append(new)
-    return LoopState(state.poses[at], attempted, found, fitting)
+    return LoopState(state.poses[at], attempted, decided_on, fitting)
 
 
 def _move_closure(

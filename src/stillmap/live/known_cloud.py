@@ -237,8 +237,8 @@ def _look_up(now: CellProbabilities, cells: Index) -> Float:
     order = np.argsort(keys)
     sought = cell_keys(cells)
     at = np.minimum(np.searchsorted(keys, sought, sorter=order), len(keys) - 1)
-    found = order[at]
-    return np.where(keys[found] == sought, now.p_occupied[found], 1.0)
+    known = order[at]
+    return np.where(keys[known] == sought, now.p_occupied[known], 1.0)
 
 
 def _read_route(folder: Path) -> Float:
@@ -273,7 +273,7 @@ def _read_points(
         more = np.column_stack([points, block.p_static, np.ones(len(points))])
         cells = np.floor(points / _SPACING).astype(np.int64)
         parts.append(_sum_up(cells, more))
-    keys, sums = _sum_up(*(np.concatenate(one) for one in zip(*parts, strict=True)))
+    keys, sums = _sum_up(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     if not len(keys):
         raise InputError("has an empty map", where=str(folder / "static.ply"))
     means = (sums[:, :4] / sums[:, 4:]).astype(np.float32)

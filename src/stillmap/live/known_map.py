@@ -112,8 +112,8 @@ class _Overlay:
 
     def __init__(self, below: GridMap, above: GridMap) -> None:
         edge = above.resolution
-        shapes = np.array([one.p_occupied.shape for one in (below, above)])
-        corners = np.array([one.origin[1::-1] for one in (below, above)])
+        shapes = np.array([grid.p_occupied.shape for grid in (below, above)])
+        corners = np.array([grid.origin[1::-1] for grid in (below, above)])
         corners = np.round(corners / edge).astype(int)
         low, high = corners.min(axis=0), (corners + shapes).max(axis=0)
         self._shape, self._corners = tuple((high - low).tolist()), corners - low

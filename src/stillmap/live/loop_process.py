@@ -152,10 +152,10 @@ def _close_loops(source: IO[bytes], target: IO[bytes]) -> None:
         if number % _TRIM_EVERY == 0:
             trim_heap()
         closer.add(*message)
-        if arrived.empty() and (found := closer.poll()) is not None:
+        if arrived.empty() and (correction := closer.poll()) is not None:
             # scan by scan: all at once would be unpacked with Python's lock held
-            send(target, (replace(found, near=[]), len(found.near)), *found.near)
-            del found
+            send(target, (replace(correction, near=[]), len(correction.near)), *correction.near)
+            del correction
             trim_heap()
 
 

@@ -182,7 +182,7 @@ class MapFrame:
         """Add the covariance (3, 3) of a step that the scans do not show."""
         self._drift = self._drift + covariance
 
-    def add(self, scan: MappedScan, found: Registration) -> None:
+    def add(self, scan: MappedScan, registered: Registration) -> None:
         """Add a spaced scan to the pose graph."""
         if self._count == len(self._spaced):
             self._spaced = np.concatenate([self._spaced, np.zeros_like(self._spaced)])
@@ -195,7 +195,7 @@ class MapFrame:
         if self._closer is not None:
             kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
             try:
-                self._closer.add(kept, found.explained, self._drift)
+                self._closer.add(kept, registered.explained, self._drift)
             except OSError as error:
                 self._give_up_loops(error)
         self._drift = np.zeros((3, 3))
@@ -220,10 +220,10 @@ class MapFrame:
                 self._correction.note_labelled(labelled)
             if added is not None:
                 self._correction.note_added(added)
-        elif (found := self._poll()) is not None and len(found.poses) > self._outdated:
+        elif (correction := self._poll()) is not None and len(correction.poses) > self._outdated:
             spaced = self._spaced[: self._count].copy()
             tagged = np.array(self._tagged)
-            new = MapCorrection(found, labels, spaced, self.spaced_poses(), tagged)
+            new = MapCorrection(correction, labels, spaced, self.spaced_poses(), tagged)
             self._correction = None if new.is_small else new
             if new.is_small:
                 self._keep_untied(new)

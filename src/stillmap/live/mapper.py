@@ -161,12 +161,12 @@ class LiveMapper:
             return empty_map(self.resolution)
         labels, output = self._slam.labels, self.options.output
         if self._slam.dimension == 2:
-            found = labels.to_map()
+            grid = labels.to_map()
         else:
             band, cells = (output.min_obstacle_height, output.max_obstacle_height), self._cells()
-            found = project_obstacles(cells, self._slam.route(), band, self.resolution)
-        origin = self._slam.known_frame.corner_to_map(found.origin)
-        return dataclasses.replace(found, origin=origin)
+            grid = project_obstacles(cells, self._slam.route(), band, self.resolution)
+        origin = self._slam.known_frame.corner_to_map(grid.origin)
+        return dataclasses.replace(grid, origin=origin)
 
     @property
     def cells(self) -> CellProbabilities:

@@ -164,8 +164,8 @@ class MoverTracker:
         radius = half.clip(_MIN_RADIUS, _MAX_RADIUS)
         center = mean + _offset(mean, sensor, radius)
         spacing = _SPACING + _SPACING_PER_METRE * np.linalg.norm(mean - sensor, axis=1)
-        others = center[:, None] - self._states.x
-        free = self._distance(others) > spacing[:, None] + self._tracks.radius - _MIN_RADIUS
+        offsets = center[:, None] - self._states.x
+        free = self._distance(offsets) > spacing[:, None] + self._tracks.radius - _MIN_RADIUS
         kept = list[int]()
         for k in np.argsort(-count, kind="stable").tolist():
             gaps = self._distance(center[kept] - center[k])
@@ -227,8 +227,8 @@ def _find_clusters(
     points, cluster, count = _connect_cells(ends) if beams.dimension == 3 else _connect(ends)
     mean, radius = _measure(points, cluster, len(count), T_sensor[:-1, -1])[1:]
     static, static_weight = _thin(np.flatnonzero(beams.hit & (p_static >= 0.5)))
-    others = _transform(beams.points[static], T_sensor)
-    squared = np.square(others).sum(axis=1) - 2.0 * mean @ others.T
+    still = _transform(beams.points[static], T_sensor)
+    squared = np.square(still).sum(axis=1) - 2.0 * mean @ still.T
     near = squared < (np.square(radius + _AMID) - np.square(mean).sum(axis=1))[:, None]
     own, amid = weight * count, static_weight * near.sum(axis=1)
     kept = (own >= _MIN_SHARE * (own + amid))[cluster]

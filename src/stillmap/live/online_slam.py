@@ -101,17 +101,17 @@ class OnlineSlam:
         prior = self.odometry.predict(beams, increment)
         hits = self.odometry.select(beams, prior)
         hits = self._weigh(hits, prior)  # E-step as predicted
-        found = self.odometry.register(beams, hits, prior, increment)  # M-step: (9)
-        self._judge(found)
-        deskewed, anchor = deskew(beams, found.twist), self.frame.last
-        labelled = LabelledScan(self._observe(deskewed, hits), found.T)
-        pose = self.frame.T_map_local @ found.T
-        if not found.is_contradicted:
+        registered = self.odometry.register(beams, hits, prior, increment)  # M-step: (9)
+        self._judge(registered)
+        deskewed, anchor = deskew(beams, registered.twist), self.frame.last
+        labelled = LabelledScan(self._observe(deskewed, hits), registered.T)
+        pose = self.frame.T_map_local @ registered.T
+        if not registered.is_contradicted:
             self.labels.add(labelled.observation, pose)
         p_static = self.labels.label(deskewed, pose)  # E-step: (8)
-        self._movers.add(deskewed, found.T, p_static)
+        self._movers.add(deskewed, registered.T, p_static)
         self._T_odom_base = T_odom_base
-        update = self._to_update(beams.stamp_ns, found, p_static)
+        update = self._to_update(beams.stamp_ns, registered, p_static)
         answer, p_static = self.known_frame.to_map(pose), p_static.copy()  # the user has the other
 
         def keep() -> MappedScan | None:
@@ -120,12 +120,12 @@ class OnlineSlam:
                 p_static,
                 T_odom_base,
                 pose=answer,
-                local=found.T,
+                local=registered.T,
                 anchor=anchor,
-                twist=found.twist,
+                twist=registered.twist,
             )
             self._hindsight.add(len(self.history) - 1, beams)
-            return self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
+            return self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), registered)
 
         if not self._finder.is_lost:
             self._work_left = keep
@@ -204,14 +204,14 @@ class OnlineSlam:
             weights = self.labels.doubt_ends(weights)
         return dataclasses.replace(hits, weights=weights)
 
-    def _judge(self, found: Registration) -> None:
+    def _judge(self, registered: Registration) -> None:
         """Whether the robot was carried, or is still where the map says."""
-        if found.is_carried:
+        if registered.is_carried:
             self._movers.clear()
             self._path_begin = self.frame.last + 1
             self._finder.lose(len(self.history), self.labels, self.frame, self.odometry)
             self.frame.begin_anew(len(self.history))
-        elif not found.is_contradicted:
+        elif not registered.is_contradicted:
             self._finder.agree(len(self.history))
 
     def _observe(self, beams: ScanBeams, hits: Any) -> Observation:
@@ -226,19 +226,19 @@ class OnlineSlam:
         beams: ScanBeams,
         labelled: LabelledScan,
         e: NDArray[np.float32],
-        found: Registration,
+        registered: Registration,
     ) -> MappedScan | None:
         """Add a scan to the local map and, if it is spaced, to the pose graph, and go on correcting
         the map; the scan if it is spaced."""
-        self.frame.add_drift(found.drift)
+        self.frame.add_drift(registered.drift)
         # without odometry nothing else says how the robot moves
-        is_doubted = found.has_odometry and self.odometry.crowd.is_dense
+        is_doubted = registered.has_odometry and self.odometry.crowd.is_dense
         recent = self.labels.doubt(e) if is_doubted else e
         added = self.odometry.add(beams, e, recent, self._label_again)
         if not self._finder.is_carried:
             if added is not None:
-                self.frame.add(added, found)
-            agrees = None if found.is_contradicted else labelled
+                self.frame.add(added, registered)
+            agrees = None if registered.is_contradicted else labelled
             self.frame.correct(agrees, added, self.labels, self.odometry)
         if self.dimension == 3 and self._finder.tie(self.frame, self.labels):
             self._path_begin = 0
@@ -271,28 +271,28 @@ class OnlineSlam:
         )
 
     def _to_update(
-        self, stamp_ns: int, found: Registration, p_static: NDArray[np.float32]
+        self, stamp_ns: int, registered: Registration, p_static: NDArray[np.float32]
     ) -> Update:
         doubts = {
-            "slip": found.is_slipping,
-            "blind": found.is_blind,
-            "carried": found.is_carried,
-            "contradicted": found.is_contradicted,
+            "slip": registered.is_slipping,
+            "blind": registered.is_blind,
+            "carried": registered.is_carried,
+            "contradicted": registered.is_contradicted,
             "lost": self._finder.is_lost,
             "ambiguous": self._finder.is_ambiguous,
         }
-        pose = self.known_frame.to_map(self.frame.T_map_local @ found.T)
+        pose = self.known_frame.to_map(self.frame.T_map_local @ registered.T)
         return Update(
             pose,
-            rotate_covariance(found.covariance, self.frame.T_map_local),
+            rotate_covariance(registered.covariance, self.frame.T_map_local),
             p_static,
             self._to_map_odom(pose),
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
             self._find_movers(),
             [
-                LaterLabels(n, self.label(one, n))
-                for n, one in self._hindsight.take(stamp_ns)
+                LaterLabels(n, self.label(beams, n))
+                for n, beams in self._hindsight.take(stamp_ns)
                 if n < self.history.kept
             ],
         )
@@ -303,7 +303,9 @@ class OnlineSlam:
         if not known.is_shifted:
             return changes
         by = np.round(known.origin[: self.dimension] / self.resolution).astype(np.int64)
-        return [dataclasses.replace(one, first_cell=one.first_cell + by) for one in changes]
+        return [
+            dataclasses.replace(change, first_cell=change.first_cell + by) for change in changes
+        ]
 
     def _find_movers(self) -> list[Mover]:
         """Moving objects at present, in the map frame."""
@@ -311,7 +313,8 @@ class OnlineSlam:
         if not known.is_shifted:
             return movers
         return [
-            dataclasses.replace(one, position=known.points_to_map(one.position)) for one in movers
+            dataclasses.replace(mover, position=known.points_to_map(mover.position))
+            for mover in movers
         ]
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:

@@ -52,10 +52,10 @@ class Localizer(ABC):
             scan: the last one; in 2D its hits.
             pose: (D+1, D+1) of the robot in the frame of the labels.
         """
-        found = self._search(labels, scan, pose)
-        self.is_ambiguous = found.is_ambiguous
-        self.is_lost = self.is_lost and found.T is None
-        return found.T
+        localization = self._search(labels, scan, pose)
+        self.is_ambiguous = localization.is_ambiguous
+        self.is_lost = self.is_lost and localization.T is None
+        return localization.T
 
     def enter(self, labels: CausalLabels, T: Float) -> None:
         """Let labels go on from the known map, with what was seen since the robot was lost."""

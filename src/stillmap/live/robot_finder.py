@@ -62,11 +62,11 @@ class Relocalizer:
         """
         if self._localizer is None:
             return None
-        found = self._localizer.localize(labels.to_view(), hits, pose)
-        self.is_ambiguous = found.is_ambiguous
-        if found.T is None:
+        localization = self._localizer.localize(labels.to_view(), hits, pose)
+        self.is_ambiguous = localization.is_ambiguous
+        if localization.T is None:
             return None
-        return np.asarray(se2.inverse(self._T_map_local) @ found.T @ self._T_map_local)
+        return np.asarray(se2.inverse(self._T_map_local) @ localization.T @ self._T_map_local)
 
     def join(self, labels: CausalLabels, local_map: LocalMap, T: Float) -> LocalMap:
         """The map of before with what was seen since, moved by T (3, 3) of `localize`: the labels
@@ -133,7 +133,7 @@ class RobotFinder:
     def is_ambiguous(self) -> bool:
         """True if several poses in the map fit about equally well."""
         searches = (self._carried, self._place)
-        return any(one is not None and one.is_ambiguous for one in searches)
+        return any(search is not None and search.is_ambiguous for search in searches)
 
     def agree(self, scan: int) -> None:
         """A scan agrees with what is seen since the robot was lost, or with the map."""
@@ -213,8 +213,8 @@ class RobotFinder:
         if self._place is not None:
             return False
         untied = frame.untied
-        for one in self._stretches:
-            one.is_tied = one.first not in untied
+        for stretch in self._stretches:
+            stretch.is_tied = stretch.first not in untied
         if self._left is None or not self._stretches[-1].is_tied:
             return False
         (left, poses), seen = self._left, labels.filter
@@ -226,25 +226,25 @@ class RobotFinder:
 
     def move(self, local: Float, scan: int) -> Float:
         """(D+1, D+1) a pose in the frame of the odometry by scans, as it is known now."""
-        for one in self._stretches:
-            if one.T is not None and one.first <= scan < (one.last or 0):
-                return np.asarray(one.T @ local)
+        for stretch in self._stretches:
+            if stretch.T is not None and stretch.first <= scan < (stretch.last or 0):
+                return np.asarray(stretch.T @ local)
         return local
 
     def move_all(self, local: Float) -> Float:
         """(T, D+1, D+1) the same of all scans."""
         out = local.copy()
-        for one in self._stretches:
-            if one.T is not None:
-                out[one.slice()] = one.T @ out[one.slice()]
+        for stretch in self._stretches:
+            if stretch.T is not None:
+                out[stretch.slice()] = stretch.T @ out[stretch.slice()]
         return out
 
     def submaps(self, scans: int) -> NDArray[np.int64]:
         """(T,) of all scans so far, see `Placement`."""
         out = np.zeros(scans, np.int64)
-        for number, one in enumerate(self._stretches, 1):
-            if one.T is None and not one.is_tied:
-                out[one.slice()] = number
+        for number, stretch in enumerate(self._stretches, 1):
+            if stretch.T is None and not stretch.is_tied:
+                out[stretch.slice()] = number
         for first, last in self._contradicted:
             out[first:last] = -1
         return out

@@ -110,13 +110,13 @@ class SweepLocalizer(Localizer):
         thin = sweep.select(np.arange(0, len(sweep.points), len(sweep.points) // _FEW_POINTS + 1))
 
         def refine(T: Float) -> Float:
-            found = se2.project_to_plane(self._register(thin, T @ in_plane)[None])[0]
-            return np.asarray(found @ se2.inverse(in_plane))
+            registered = se2.project_to_plane(self._register(thin, T @ in_plane)[None])[0]
+            return np.asarray(registered @ se2.inverse(in_plane))
 
-        found = self._planar.search(self._view.draw(labels), refine)
-        if found.T is None:
-            return found
-        T_map_base = self._register(sweep, found.T @ in_plane)
+        localization = self._planar.search(self._view.draw(labels), refine)
+        if localization.T is None:
+            return localization
+        T_map_base = self._register(sweep, localization.T @ in_plane)
         points = sweep.points.astype(np.float64)
         overlap = plane_overlap(points, self._seen, pose, self._local_map.planes, T_map_base)
         if overlap < MIN_PLANE_OVERLAP:

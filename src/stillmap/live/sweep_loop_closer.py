@@ -71,14 +71,14 @@ def find_alike(view: View, earlier: NDArray[np.float32], count: int) -> list[Can
     spectra = np.fft.rfft(earlier, axis=2) * np.conj(np.fft.rfft(view, axis=1))
     correlation = np.fft.irfft(spectra.sum(axis=1), _SECTORS, axis=1)  # (K, S)
     best = correlation.max(axis=1)
-    found = list[Candidate]()
+    candidates = list[Candidate]()
     for k in np.argsort(-best, kind="stable").tolist():
-        if len(found) == count:
+        if len(candidates) == count:
             break
-        if all(abs(k - one.number) > 1 for one in found):
+        if all(abs(k - better.number) > 1 for better in candidates):
             yaw = float(np.argmax(correlation[k])) * 2.0 * np.pi / _SECTORS
-            found.append(Candidate(k, yaw, float(best[k])))
-    return found
+            candidates.append(Candidate(k, yaw, float(best[k])))
+    return candidates
 
 
 class LiveSweepLoopCloser:
@@ -118,8 +118,8 @@ class LiveSweepLoopCloser:
             return None
         carried = _find_carried(view)
         chain = [
-            replace(one, covariance=_ANYWHERE) if one.second in carried else one
-            for one in closer.odometry_constraints()
+            replace(step, covariance=_ANYWHERE) if step.second in carried else step
+            for step in closer.odometry_constraints()
         ]
         corrected, self._found = loop_closure.solve_graph(
             closer.keyframes, chain, view.poses, self._found, MAX_CHI2
@@ -134,18 +134,18 @@ class LiveSweepLoopCloser:
     ) -> LoopClosure | None:
         """The closure of keyframe k with an earlier one: with one that looks alike, as long as it
         is not known where the robot was carried."""
-        first = max((one for one in _find_carried(view) if one <= k), default=0)
-        known = (one for one in self._found if one.earlier < first <= one.later)
-        if not first or any(not one.rejected for one in known):
+        first = max((keyframe for keyframe in _find_carried(view) if keyframe <= k), default=0)
+        known = (closure for closure in self._found if closure.earlier < first <= closure.later)
+        if not first or any(not closure.rejected for closure in known):
             return closer.search_keyframe(k, self._search)
         search = self._search
         search.corrected[k] = search.correction @ view.poses[k]
-        for one in find_alike(self._view(view, k), self._views(view, first), _MAX_ALIKE):
+        for candidate in find_alike(self._view(view, k), self._views(view, first), _MAX_ALIKE):
             T = np.eye(4)
-            T[:2, :2] = se2.matrix(0.0, 0.0, one.yaw)[:2, :2]
-            closure = closer.verify(one.number, k, T, *_ALIKE_STD)
+            T[:2, :2] = se2.matrix(0.0, 0.0, candidate.yaw)[:2, :2]
+            closure = closer.verify(candidate.number, k, T, *_ALIKE_STD)
             if not closure.rejected:
-                search.corrected[k] = search.corrected[one.number] @ closure.T
+                search.corrected[k] = search.corrected[candidate.number] @ closure.T
                 search.correction = search.corrected[k] @ se2.inverse(view.poses[k])
                 search.since = float(closer.travelled[k])
                 return closure
@@ -191,12 +191,14 @@ def _find_carried(view: SpacedView) -> list[int]:
 
 def _find_untied(carried: Sequence[int], closures: Sequence[LoopClosure]) -> tuple[int, ...]:
     """Those of them whose stretch no loops tie to the first one, nor to others that are."""
-    accepted = [one for one in closures if not one.rejected]
-    ends = np.array([(one.earlier, one.later) for one in accepted], np.int64).reshape(-1, 2)
+    accepted = [closure for closure in closures if not closure.rejected]
+    ends = np.array([(closure.earlier, closure.later) for closure in accepted], np.int64).reshape(
+        -1, 2
+    )
     stretches = np.searchsorted(carried, ends, side="right")  # 0: before the first time
     counts = Counter((int(a), int(b)) for a, b in stretches if a != b)
     loops = [pair for pair, count in counts.items() if count >= _MIN_LOOPS]
     tied = {0}
     for _ in carried:
-        tied |= {one for pair in loops if not tied.isdisjoint(pair) for one in pair}
+        tied |= {stretch for pair in loops if not tied.isdisjoint(pair) for stretch in pair}
     return tuple(k for number, k in enumerate(carried, 1) if number not in tied)

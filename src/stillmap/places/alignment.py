@@ -58,11 +58,11 @@ def search_alignments(
         return []
     search = _Search(place, session, free_weight, gone_weight)
     headings = np.arange(search.headings) * (2.0 * np.pi / search.headings)
-    found = [one for heading in headings.tolist() for one in search.find_optima(heading)]
-    found.sort(key=lambda one: -one.score)
+    optima = [optimum for heading in headings.tolist() for optimum in search.find_optima(heading)]
+    optima.sort(key=lambda optimum: -optimum.score)
     return [
-        _to_alignment(search.middle, one.x, one.y, one.heading)
-        for one in _remove_duplicates(found, search)
+        _to_alignment(search.middle, optimum.x, optimum.y, optimum.heading)
+        for optimum in _remove_duplicates(optima, search)
     ]
 
 
@@ -163,10 +163,10 @@ def _find_maxima(score: Raster, most: int) -> NDArray[np.intp]:
         x, y = np.divmod(at, Y)
         rows = (x[:, None] + around) % X * Y
         near = rows[:, :, None] + ((y[:, None] + around) % Y)[:, None, :]
-        found = at[values[at] >= values[near].max(axis=(1, 2))]
-        if len(found) >= most or limit <= 0.0:
+        maxima = at[values[at] >= values[near].max(axis=(1, 2))]
+        if len(maxima) >= most or limit <= 0.0:
             break
-    return np.asarray(found[np.argsort(-values[found], kind="stable")[:most]])
+    return np.asarray(maxima[np.argsort(-values[maxima], kind="stable")[:most]])
 
 
 def middle_of(session: SurfaceMap) -> Float:
@@ -174,18 +174,18 @@ def middle_of(session: SurfaceMap) -> Float:
     return np.asarray(session.surface.mean(axis=0, dtype=np.float64))
 
 
-def _remove_duplicates(found: list[_Optimum], search: _Search) -> list[_Optimum]:
+def _remove_duplicates(optima: list[_Optimum], search: _Search) -> list[_Optimum]:
     """The best ones that lie apart from all better ones."""
     apart = _SAME_CELLS * search.cell
     turn = _SAME_TURNS * 2.0 * np.pi / search.headings
     out = list[_Optimum]()
-    for one in found:
+    for optimum in optima:
         if not any(
-            np.hypot(one.x - other.x, one.y - other.y) <= apart
-            and abs(float(se2.wrap(one.heading - other.heading))) <= turn
-            for other in out
+            np.hypot(optimum.x - better.x, optimum.y - better.y) <= apart
+            and abs(float(se2.wrap(optimum.heading - better.heading))) <= turn
+            for better in out
         ):
-            out.append(one)
+            out.append(optimum)
         if len(out) == _MAX_FOUND:
             break
     return out
@@ -254,7 +254,7 @@ class MapRefiner:
             moves = np.diag([step, step, step / self._spread])
             for _ in range(_MAX_MOVES):
                 tried = np.concatenate([x + moves, x - moves])
-                scores = [self._score(one) for one in tried]
+                scores = [self._score(candidate) for candidate in tried]
                 k = int(np.argmax(scores))
                 if scores[k] <= best:
                     break
@@ -268,12 +268,12 @@ class MapRefiner:
             self._session, self._place, se2.inverse(T)
         )
 
-    def _look_up(self, known: _Layer, other: _Layer, T: Float) -> float:
-        points = other.points @ T[:2, :2].T + T[:2, 2]
+    def _look_up(self, known: _Layer, seen: _Layer, T: Float) -> float:
+        points = seen.points @ T[:2, :2].T + T[:2, 2]
         at = np.floor(points / self._edge).astype(np.int64) - known.low
         inside = ((at >= 0) & (at < known.field.shape)).all(axis=1)
         x, y = at[inside].T
-        return other.weight * float(known.field[x, y].sum())
+        return seen.weight * float(known.field[x, y].sum())
 
 
 def _make_layer(known: SurfaceMap) -> _Layer:
@@ -320,15 +320,15 @@ def propose_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Hypothesi
         place: its surfaces and free space.
         session: those of the session, in its own frame.
     """
-    found = search_alignments(place, session)
-    if not found:
+    proposed = search_alignments(place, session)
+    if not proposed:
         return []
     refiner = MapRefiner(place, session)
-    poses = [refiner.refine(T) for T in found]
+    poses = [refiner.refine(T) for T in proposed]
     refined = [Hypothesis(T, compare_maps(place, session, T)) for T in poses]
     best = _distinct_hypotheses(refined, session)[:_MAX_HYPOTHESES]
     registration = _Registration(place, session)
-    return _distinct_hypotheses([registration.refine(one) for one in best], session)
+    return _distinct_hypotheses([registration.refine(hypothesis) for hypothesis in best], session)
 
 
 class _Registration:
@@ -358,9 +358,9 @@ class _Registration:
             max_candidates=1,
             T_start=start.T,
         )
-        found = Hypothesis(T, compare_maps(self._place, self._session, T))
-        kept = found.comparison.score >= _MIN_KEPT * start.comparison.score
-        return found if kept else start
+        registered = Hypothesis(T, compare_maps(self._place, self._session, T))
+        kept = registered.comparison.score >= _MIN_KEPT * start.comparison.score
+        return registered if kept else start
 
 
 def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> list[Hypothesis]:
@@ -368,8 +368,8 @@ def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> l
     middle = np.append(middle_of(session), 1.0)
     out = list[Hypothesis]()
     for one in sorted(hypotheses, key=lambda hypothesis: -hypothesis.comparison.score):
-        distance = [float(np.linalg.norm((one.T - other.T) @ middle)) for other in out]
-        turn = [abs(se2.parameters(se2.inverse(one.T) @ other.T)[2]) for other in out]
+        distance = [float(np.linalg.norm((one.T - better.T) @ middle)) for better in out]
+        turn = [abs(se2.parameters(se2.inverse(one.T) @ better.T)[2]) for better in out]
         if not any(
             d < _RIVAL_DISTANCE and a < _RIVAL_ANGLE for d, a in zip(distance, turn, strict=True)
         ):

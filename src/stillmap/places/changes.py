@@ -53,16 +53,16 @@ def change_records(
         frame: of the changes, in the map frame.
     """
     out = []
-    for number, one in enumerate(changes):
+    for number, change in enumerate(changes):
         record: dict[str, object] = {
             "id": number,
-            "kind": one.kind,
-            "box": _corners(one.low, one.high, frame),
+            "kind": change.kind,
+            "box": _corners(change.low, change.high, frame),
         }
-        if one.from_low is not None and one.from_high is not None:
-            record["from_box"] = _corners(one.from_low, one.from_high, frame)
-        record["between"] = [names[one.before], names[one.after]]
-        record["probability"] = round(one.probability, 4)
+        if change.from_low is not None and change.from_high is not None:
+            record["from_box"] = _corners(change.from_low, change.from_high, frame)
+        record["between"] = [names[change.before], names[change.after]]
+        record["probability"] = round(change.probability, 4)
         out.append(record)
     return out
 
@@ -79,7 +79,7 @@ def change_cells(
 ) -> dict[str, NDArray[np.generic]]:
     """The cells of all changes: `change` (K,) the entry of `changes.json`, and `xy` (K, 2) or `xyz`
     (K, 3), the centres of the cells in metres."""
-    cells = [one.cells for one in changes]
+    cells = [change.cells for change in changes]
     number = np.repeat(np.arange(len(changes), dtype=np.int32), [len(of) for of in cells])
     of = np.concatenate([np.zeros(0, np.intp), *cells])
     D = place.cells.shape[1]
@@ -126,7 +126,9 @@ def detect_place_changes(place: PlaceStates) -> tuple[PlaceStates, list[PlaceCha
     place = _share_evidence(place, groups)
     out = [_make_change(group, place) for group in _find_groups(place)]
     out = _pair_positions(out, place)
-    return place, sorted(out, key=lambda one: (one.after, one.before, *one.low.tolist()))
+    return place, sorted(
+        out, key=lambda change: (change.after, change.before, *change.low.tolist())
+    )
 
 
 def _find_groups(place: PlaceStates) -> list[_Events]:
@@ -156,7 +158,7 @@ def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
     first, last = beside.before[at], beside.after[at]
     at = max((at[(first <= s) & (last > s)] for s in range(before, after)), key=len)
     return _Events._make(
-        np.concatenate([one, other[at]]) for one, other in zip(group, beside, strict=True)
+        np.concatenate([own, further[at]]) for own, further in zip(group, beside, strict=True)
     )
 
 
@@ -214,7 +216,7 @@ def _group_events(events: _Events, place: PlaceStates) -> list[_Events]:
     begin = np.maximum(events.before[i], events.before[j])
     end = np.minimum(events.after[i], events.after[j])
     fits = (events.came[i] == events.came[j]) & (begin < end)
-    return [events.select(one) for one in connected_components(pairs[fits], len(events.cell))]
+    return [events.select(group) for group in connected_components(pairs[fits], len(events.cell))]
 
 
 def _split_by_time(events: _Events, min_cells: int) -> list[_Events]:
@@ -255,8 +257,8 @@ def _box(place: PlaceStates, cells: Index) -> tuple[Float, Float]:
 def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[PlaceChange]:
     """Objects that are gone in one place and appeared in another at the same time are one."""
     hinged = _find_doors(changes, place)
-    gone = [k for k, one in enumerate(changes) if one.kind == "gone"]
-    came = [k for k, one in enumerate(changes) if one.kind == "appeared"]
+    gone = [k for k, change in enumerate(changes) if change.kind == "gone"]
+    came = [k for k, change in enumerate(changes) if change.kind == "appeared"]
     pairs = []
     for i in gone:
         for j in came:
@@ -272,7 +274,7 @@ def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[Plac
             out.append(_join(changes[i], changes[j], kind, place))
     # most often one position of a door is seen: shut it hides the other, open it stands aside
     out += [replace(changes[k], kind="door") for k in sorted(hinged - used)]
-    return out + [one for k, one in enumerate(changes) if k not in used | hinged]
+    return out + [change for k, change in enumerate(changes) if k not in used | hinged]
 
 
 def _compare_positions(
@@ -283,8 +285,8 @@ def _compare_positions(
     has_hinge: whether one of them stands beside a gap in a wall that it could shut.
     """
     if has_hinge:
-        one, other = _fit_leaf(place, gone.cells), _fit_leaf(place, came.cells)
-        turned = one is not None and other is not None and turn_about_hinge(one, other)
+        before, after = _fit_leaf(place, gone.cells), _fit_leaf(place, came.cells)
+        turned = before is not None and after is not None and turn_about_hinge(before, after)
         return ("door", -1.0) if turned else (None, 0.0)
     distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))
     sides = np.sort(gone.high - gone.low), np.sort(came.high - came.low)
@@ -305,19 +307,19 @@ def _fit_leaf(place: PlaceStates, cells: Index) -> Leaf | None:
 def _find_doors(changes: list[PlaceChange], place: PlaceStates) -> set[int]:
     """The changes that are a leaf beside a gap in a wall that it could shut."""
     is_static = place.states.p_static > _MIN_PROBABILITY
-    for one in changes:
-        is_static[one.cells] = False
+    for change in changes:
+        is_static[change.cells] = False
     static = place.cells[is_static]
     margin = np.full(static.shape[1], np.ceil(_WALL_MARGIN / place.resolution))
     out = set()
-    for k, one in enumerate(changes):
-        leaf = _fit_leaf(place, one.cells)
+    for k, change in enumerate(changes):
+        leaf = _fit_leaf(place, change.cells)
         if leaf is None:
             continue
-        low, high = one.low / place.resolution - margin, one.high / place.resolution + margin
+        low, high = change.low / place.resolution - margin, change.high / place.resolution + margin
         if len(low) == 3:  # walls at the height of its upper half, without floor and lintel
             low[2], high[2] = (
-                (0.5 * (one.low + one.high) / place.resolution)[2],
+                (0.5 * (change.low + change.high) / place.resolution)[2],
                 high[2] - margin[2],
             )
         near = static[((static >= low) & (static < high)).all(axis=1)]

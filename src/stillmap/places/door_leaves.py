@@ -39,14 +39,14 @@ def fit_leaf(points: Float) -> Leaf | None:
     return Leaf(ends, length)
 
 
-def turn_about_hinge(one: Leaf, other: Leaf) -> bool:
+def turn_about_hinge(first: Leaf, second: Leaf) -> bool:
     """Whether two leaves are one in two positions: as long as each other, with a common end."""
-    apart = np.linalg.norm(one.ends[:, None] - other.ends[None], axis=2)
+    apart = np.linalg.norm(first.ends[:, None] - second.ends[None], axis=2)
     i, j = np.unravel_index(int(apart.argmin()), (2, 2))
-    u, v = one.ends[1 - i] - one.ends[i], other.ends[1 - j] - other.ends[j]
+    u, v = first.ends[1 - i] - first.ends[i], second.ends[1 - j] - second.ends[j]
     cosine = float(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)))
     turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    lengths = sorted((one.length, other.length))
+    lengths = sorted((first.length, second.length))
     alike = lengths[1] <= _MAX_RATIO * lengths[0] + _MAX_TURN_GAP
     return bool(apart[i, j] <= _MAX_TURN_GAP and alike and turned >= _MIN_TURN)
 
@@ -61,8 +61,8 @@ def is_hinged(leaf: Leaf, wall: Float) -> bool:
     if leaf.length > _WIDTH[1] or not len(wall):
         return False
     angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
-    for end, other in (leaf.ends, leaf.ends[::-1]):
-        own = float(np.arctan2(*(other - end)[::-1]))
+    for end, far_end in (leaf.ends, leaf.ends[::-1]):
+        own = float(np.arctan2(*(far_end - end)[::-1]))
         reach = np.linalg.norm(wall - end, axis=1)
         if reach.min() > _END_GAP:
             continue

@@ -153,7 +153,7 @@ class Evidence(ShortRepr):
         inside = np.flatnonzero(((at >= 0) & (at < count)).all(axis=1))
         blocks = tuple(i for column in at[inside].T for i in (column, slice(None)))
         whole = tuple((count * edge).tolist())
-        split = tuple(n for one in count.tolist() for n in (one, edge))
+        split = tuple(n for n_blocks in count.tolist() for n in (n_blocks, edge))
         start = (low - first * edge).tolist()
         box = tuple(slice(begin, begin + n) for begin, n in zip(start, shape, strict=True))
         out = []

@@ -132,11 +132,11 @@ def _find_limit(place: Place, map_state: str) -> int | None:
         return len(in_time) - 1
     if map_state == MAJORITY:
         return None
-    names = [one.name for one in in_time]
+    names = [session.name for session in in_time]
     if map_state in names:
         return names.index(map_state)
     until = _parse_date(map_state)
-    before = [k for k, one in enumerate(in_time) if int(one.stamp_ns[0]) <= until]
+    before = [k for k, session in enumerate(in_time) if int(session.stamp_ns[0]) <= until]
     if not before:
         raise InputError(f"no session is as old as the state that the map shall show: {map_state}")
     return before[-1]
@@ -172,10 +172,12 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         _write_session(folder, result, place.sessions[k], time)
     _write_place_files(folder, result)
     write_objects(folder, place)
-    joined = join_keyframes([one.session.keyframes for one in place.sessions]).recording
-    poses = np.concatenate([one.keyframe_poses for one in place.sessions])
+    joined = join_keyframes([placed.session.keyframes for placed in place.sessions]).recording
+    poses = np.concatenate([placed.keyframe_poses for placed in place.sessions])
     if place.dimension == 3:
-        labels = np.concatenate([_label_keyframes(one, result.shown) for one in place.sessions])
+        labels = np.concatenate(
+            [_label_keyframes(placed, result.shown) for placed in place.sessions]
+        )
         write_clouds(folder, joined, frame.to_map(poses), labels, origin=frame.origin)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
@@ -207,7 +209,7 @@ def place_record(
         "input": {
             "format": "stillmap place",
             "path": None,
-            "sessions": [one.session.name for one in place.sessions],
+            "sessions": [placed.session.name for placed in place.sessions],
         },
         "dimension": place.dimension,
         **({LOCAL_ORIGIN: origin.tolist()} if origin.any() else {}),
@@ -215,7 +217,9 @@ def place_record(
         "iterations": [],
         "counts": _count(folder),
         "area": {"known": round(known * place.resolution**2, 6)},
-        "warnings": [f"{one.name} is not in the place: {one.why}" for one in result.refusals],
+        "warnings": [
+            f"{refusal.name} is not in the place: {refusal.why}" for refusal in result.refusals
+        ],
         "quality": {},
         "place": {
             "resolution": place.resolution,
@@ -248,22 +252,24 @@ def _count(folder: Path) -> dict[str, int]:
     }
 
 
-def _write_session(folder: Path, result: PlaceResult, one: PlacedSession, time: int) -> None:
+def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, time: int) -> None:
     """Write what differs from merge to merge into `sessions/NAME/`; `time` is its index there."""
-    place, home = result.place, folder / "sessions" / one.session.name
-    write_tum(home / "trajectory.tum", one.session.stamp_ns, place.local_frame.to_map(one.poses))
+    place, home = result.place, folder / "sessions" / placed.session.name
+    write_tum(
+        home / "trajectory.tum", placed.session.stamp_ns, place.local_frame.to_map(placed.poses)
+    )
     n_beams = int(np.load(home / "beams" / "offset.npy", mmap_mode="r")[-1])
     beams = read_beam_cells(home, n_beams, place.voxel_size)
-    centres = beams.place_centres(one.session.node_poses, one.nodes)
+    centres = beams.place_centres(placed.session.node_poses, placed.nodes)
     write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
-    write_placement(home, one)
+    write_placement(home, placed)
 
 
-def _label_keyframes(one: PlacedSession, shown: ShownState) -> NDArray[np.float32]:
+def _label_keyframes(placed: PlacedSession, shown: ShownState) -> NDArray[np.float32]:
     """(M,) P(static) of the beams of a session's keyframes, as the map shows the place."""
-    keyframes = one.session.keyframes
+    keyframes = placed.session.keyframes
     beams = np.flatnonzero(keyframes.recording.hit)
-    ends = keyframes.recording.end_points(beams, one.keyframe_poses)
+    ends = keyframes.recording.end_points(beams, placed.keyframe_poses)
     # look_up gives 0 where nothing ever stood clearly: those beams keep their own label
     p_gone = shown.place.look_up(ends, 1.0 - shown.p_shown)
     labels = np.array(keyframes.e)
@@ -274,8 +280,8 @@ def _label_keyframes(one: PlacedSession, shown: ShownState) -> NDArray[np.float3
 def _write_place_files(folder: Path, result: PlaceResult) -> None:
     """Write the files of the place as a whole, but the map, the report and `run.json`."""
     place, frame, names = result.place, result.place.local_frame, result.names_in_time
-    homes = [folder / "sessions" / one.session.name for one in place.sessions]
-    poses = frame.to_map(np.concatenate([one.poses for one in place.sessions]))
+    homes = [folder / "sessions" / placed.session.name for placed in place.sessions]
+    poses = frame.to_map(np.concatenate([placed.poses for placed in place.sessions]))
     with (folder / "trajectory.tum").open("wb") as file:
         for home in homes:
             file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
@@ -290,21 +296,23 @@ def _write_place_files(folder: Path, result: PlaceResult) -> None:
 
 def _join_graphs(place: Place) -> PoseGraph:
     """The pose graph of all sessions; scans are numbered through all of them."""
-    first_scan = np.cumsum([0, *(len(one.session.stamp_ns) for one in place.sessions)])
+    first_scan = np.cumsum([0, *(len(placed.session.stamp_ns) for placed in place.sessions)])
     keyframes = [
-        one.session.graph.keyframes + first
-        for one, first in zip(place.sessions, first_scan, strict=False)
+        placed.session.graph.keyframes + first
+        for placed, first in zip(place.sessions, first_scan, strict=False)
     ]
-    chain, loops = join_constraints([one.session for one in place.sessions], place.ties)
-    nodes = np.concatenate([one.nodes for one in place.sessions])
+    chain, loops = join_constraints([placed.session for placed in place.sessions], place.ties)
+    nodes = np.concatenate([placed.nodes for placed in place.sessions])
     return PoseGraph(np.concatenate(keyframes), nodes, [*chain, *loops])
 
 
 def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     """The entries of `sessions.json`, in the order in which the inputs were given."""
-    placed = {one.session.name: one for one in result.place.sessions}
-    refused = {one.name: one for one in result.refusals}
-    counts = [len(one.session.stamp_ns) for one in result.place.sessions]
+    placed = {
+        placed_session.session.name: placed_session for placed_session in result.place.sessions
+    }
+    refused = {refusal.name: refusal for refusal in result.refusals}
+    counts = [len(placed_session.session.stamp_ns) for placed_session in result.place.sessions]
     first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
     return [
         _placed_record(placed[name], first_scan[name], result.place.local_frame)
@@ -320,16 +328,16 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     ]
 
 
-def _placed_record(one: PlacedSession, first_scan: int, frame: LocalFrame) -> dict[str, Any]:
+def _placed_record(placed: PlacedSession, first_scan: int, frame: LocalFrame) -> dict[str, Any]:
     """The entry of a session whose scans begin at `first_scan` of those of the place."""
-    stamp_ns = one.session.stamp_ns
+    stamp_ns = placed.session.stamp_ns
     return {
-        "name": one.session.name,
-        "input": one.session.input,
+        "name": placed.session.name,
+        "input": placed.session.input,
         "accepted": True,
-        "T_place_session": one.between_maps(one.T, frame).tolist(),
-        "covariance": one.known_covariance.tolist(),
-        "overlap": round(one.overlap, 4),
+        "T_place_session": placed.between_maps(placed.T, frame).tolist(),
+        "covariance": placed.known_covariance.tolist(),
+        "overlap": round(placed.overlap, 4),
         "first_stamp_ns": int(stamp_ns[0]),
         "last_stamp_ns": int(stamp_ns[-1]),
         "first_scan": first_scan,

@@ -38,26 +38,26 @@ _MAX_TILT = 0.1  # rad
 _REACH = 20.0  # m between nodes at which the ground is the same
 
 
-def lift_alignment(place: Place, session: Session, found: Placement) -> Float:
+def lift_alignment(place: Place, session: Session, placement: Placement) -> Float:
     """(N, D+1, D+1) poses of a session's nodes in the place, by an alignment in the plane.
 
     In 3D, height and tilt are those at which the ground lies as the place knows it: the base of
     two keyframes near each other is as high above it as each was.
     """
     if session.dimension == 2:
-        return found.T @ session.node_poses
+        return placement.T @ session.node_poses
     T = np.eye(4)
-    T[:2, :2], T[:2, 3] = found.T[:2, :2], found.T[:2, 2]
+    T[:2, :2], T[:2, 3] = placement.T[:2, :2], placement.T[:2, 2]
     nodes = T @ session.node_poses
     clearance = session.clearance[session.keyframes.nodes]
     at, rise = [np.zeros((0, 3))], [np.zeros(0)]
-    for other in place.sessions:
-        theirs, their_clearance = other.nodes, other.session.clearance
+    for known in place.sessions:
+        theirs, their_clearance = known.nodes, known.session.clearance
         distance = np.linalg.norm(nodes[:, None, :2, 3] - theirs[None, :, :2, 3], axis=2)
         nearest = distance.argmin(axis=1)
         near = np.flatnonzero(distance.min(axis=1) <= _REACH)
         of = nearest[near]
-        ground = theirs[of, 2, 3] - their_clearance[other.session.keyframes.nodes[of]]
+        ground = theirs[of, 2, 3] - their_clearance[known.session.keyframes.nodes[of]]
         at.append(nodes[near, :3, 3])
         rise.append(ground + clearance[near] - nodes[near, 2, 3])
     return _tilt(np.concatenate(at), np.concatenate(rise)) @ nodes
@@ -133,21 +133,21 @@ def add_session(
         report: called with the step that begins.
     """
     report("aligning")
-    found = find_placement(place.sessions, session)
-    if found.refused and not found.rivals:
-        return Growth(place, found.refused)
-    start = placed = PlacedSession(session, lift_alignment(place, session, found))
-    matches, states = found.matches, None
+    placement = find_placement(place.sessions, session)
+    if placement.refused and not placement.rivals:
+        return Growth(place, placement.refused)
+    start = placed = PlacedSession(session, lift_alignment(place, session, placement))
+    matches, states = placement.matches, None
     if place.dimension == 3:
         matches = match_session(place, placed, PREDICTION_STD, None, threads)
-        if found.rivals and not _beats_rivals(place, session, found, matches, threads):
-            return Growth(place, found.refused)
+        if placement.rivals and not _beats_rivals(place, session, placement, matches, threads):
+            return Growth(place, placement.refused)
     for number in range(_EM_ROUNDS):
         if states is not None:
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
         report("optimizing poses")
         ties = make_ties(matches, len(place.sessions))
-        if place.dimension == 3 or not found.matches:
+        if place.dimension == 3 or not placement.matches:
             ties.append(_tie_maps(place, start))
         elif len(ties) < _MIN_TIES:
             return Growth(place, "too few of its keyframes can be registered to the place")
@@ -168,21 +168,21 @@ def add_session(
 
 def _differing_share(place: Place) -> float:
     """Share of the surfaces seen by the last session and by others in conflict."""
-    *known, last = [one.require_evidence()[1] for one in place.sessions]
+    *known, last = [placed.require_evidence()[1] for placed in place.sessions]
     maps = make_surface_map(known), make_surface_map([last])
     agree, conflict = compare_maps(*maps, np.eye(3))
     return conflict / max(agree + conflict, 1)
 
 
 def _beats_rivals(
-    place: Place, session: Session, found: Placement, matches: Matches, threads: int
+    place: Place, session: Session, placement: Placement, matches: Matches, threads: int
 ) -> bool:
     """Whether an alignment, with these matches, leaves far less unexplained than others do."""
     unexplained = _unexplained_share(matches)
     if unexplained > _MAX_UNEXPLAINED:
         return False
-    for T in found.rivals:
-        nodes = lift_alignment(place, session, replace(found, T=T))
+    for T in placement.rivals:
+        nodes = lift_alignment(place, session, replace(placement, T=T))
         rival = match_session(place, PlacedSession(session, nodes), PREDICTION_STD, None, threads)
         if unexplained > _MAX_UNEXPLAINED_RATIO * _unexplained_share(rival):
             return False
@@ -220,13 +220,13 @@ def match_session(
     nodes = list(range(len(session.keyframes.nodes)))
     out = {}
     for index in select_references(place.sessions, session.planar, planar_poses):
-        other = place.sessions[index]
+        reference = place.sessions[index]
         if place.dimension == 3:
-            out[index] = matching.match_sweeps(other, placed, std, nodes, threads)
+            out[index] = matching.match_sweeps(reference, placed, std, nodes, threads)
             continue
         out[index] = matching.match_sessions(
-            _weigh(other.session.planar, other.planar_poses, states),
-            other.planar_poses,
+            _weigh(reference.session.planar, reference.planar_poses, states),
+            reference.planar_poses,
             _weigh(session.planar, planar_poses, states),
             planar_poses,
             std,
@@ -263,10 +263,10 @@ def _tie_maps(place: Place, start: PlacedSession) -> Tie:
     D = place.dimension
     ours, theirs = start.nodes[:, :D, D], place.sessions[index].nodes[:, :D, D]
     distance = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
-    node, other = np.unravel_index(int(distance.argmin()), distance.shape)
-    T = se2.inverse(place.sessions[index].nodes[other]) @ start.nodes[node]
+    node, reference_node = np.unravel_index(int(distance.argmin()), distance.shape)
+    T = se2.inverse(place.sessions[index].nodes[reference_node]) @ start.nodes[node]
     covariance = np.diag(np.square(_MAP_STD[D]))
-    return Tie(index, int(other), len(place.sessions), int(node), T, covariance)
+    return Tie(index, int(reference_node), len(place.sessions), int(node), T, covariance)
 
 
 def _optimize(place: Place, placed: PlacedSession, ties: list[Tie]) -> tuple[Place, float]:
@@ -275,7 +275,7 @@ def _optimize(place: Place, placed: PlacedSession, ties: list[Tie]) -> tuple[Pla
     sessions = [*place.sessions, placed]
     all_ties = [*place.ties, *ties]
     nodes, agree = optimize_nodes(
-        [one.session for one in sessions], [one.nodes for one in sessions], all_ties
+        [each.session for each in sessions], [each.nodes for each in sessions], all_ties
     )
     kept = [tie for tie, agrees in zip(all_ties, agree.tolist(), strict=True) if agrees]
     grown = replace(place, sessions=sessions, ties=kept).with_nodes(nodes)

@@ -97,11 +97,11 @@ def list_sessions(groups: Sequence[Given], taken: Sequence[str] = ()) -> list[Se
     out, names = list[SessionInput](), set(taken)
     for group in groups:
         if isinstance(group, Recording | Result):
-            one = SessionInput(_unique(_name_given(group), names), given=group)
+            session = SessionInput(_unique(_name_given(group), names), given=group)
         else:
-            one = _find_session(tuple(Path(path) for path in group), names)
-        names.add(one.name)
-        out.append(one)
+            session = _find_session(tuple(Path(path) for path in group), names)
+        names.add(session.name)
+        out.append(session)
     return out
 
 
@@ -168,28 +168,28 @@ def prepare_sessions(
         InputError: an input cannot be read or mapped.
     """
     out = []
-    for number, one in enumerate(inputs, start=1):
+    for number, session in enumerate(inputs, start=1):
 
         def report(stage: str, iteration: int, done: int, total: int, number: int = number) -> None:
             progress(f"session {number}: {stage}", iteration, done, total)
 
-        out.append(_prepare_session(one, options, odometry, folder, report))
+        out.append(_prepare_session(session, options, odometry, folder, report))
     return out
 
 
 def _prepare_session(
-    one: SessionInput, options: Options, odometry: bool, folder: Path, report: Progress
+    session: SessionInput, options: Options, odometry: bool, folder: Path, report: Progress
 ) -> Session:
-    given = one.given
-    if one.is_result:
-        return _keep_session(one, one.parts[0], folder, options)
+    given = session.given
+    if session.is_result:
+        return _keep_session(session, session.parts[0], folder, options)
     if isinstance(given, Result) and given.path is not None:
-        return _keep_session(one, given.path, folder, options, given.recording)
+        return _keep_session(session, given.path, folder, options, given.recording)
     with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
         if isinstance(given, Result):
             result = given
         else:
-            paths = [str(path) for path in one.parts]
+            paths = [str(path) for path in session.parts]
             result = build(
                 given or (paths[0] if len(paths) == 1 else paths),
                 options,
@@ -201,11 +201,11 @@ def _prepare_session(
         result.save(mapped)
         recording = result.recording
         del result
-        return _keep_session(one, mapped, folder, options, recording)
+        return _keep_session(session, mapped, folder, options, recording)
 
 
 def _keep_session(
-    one: SessionInput,
+    source: SessionInput,
     mapped: Path,
     folder: Path,
     options: Options,
@@ -214,7 +214,7 @@ def _keep_session(
     """Write what the place keeps of a mapped session, and open it again from there.
 
     Args:
-        one: the session.
+        source: the session.
         mapped: its result.
         folder: of the place.
         options: of mapping, and of the map.
@@ -226,10 +226,10 @@ def _keep_session(
     else:
         slam_options = RunRecord(mapped, result.run).slam_options
         deskewed = deskew_recording(recording, result.poses, slam_options)
-    session = to_session(one.name, result, deskewed, resolve_threads(options.threads))
+    session = to_session(source.name, result, deskewed, resolve_threads(options.threads))
     cell, p_static = cell_size(options, session.dimension), np.asarray(result.p_static)
     beams = find_beam_cells(deskewed, session.poses, p_static, session.graph, cell)
-    home = folder / "sessions" / one.name
+    home = folder / "sessions" / source.name
     home.mkdir()
     _copy_record(mapped, home, session)
     (home / "beams").mkdir()
@@ -238,7 +238,7 @@ def _keep_session(
     write_arrays(home / "beams", arrays)
     write_session(home, session, beams)
     copy_objects(mapped, home / STATE)
-    return read_session(home, one.path, np.array(session.stamp_ns))
+    return read_session(home, source.path, np.array(session.stamp_ns))
 
 
 def to_session(name: str, result: Result, deskewed: Recording, threads: int) -> Session:

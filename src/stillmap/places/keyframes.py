@@ -133,28 +133,28 @@ def _progress(
 def join_keyframes(sessions: Sequence[Keyframes]) -> Keyframes:
     """The keyframes of some sessions, one or more, as those of one; poses are still each in its own
     frame."""
-    recordings = [one.recording for one in sessions]
-    beams = np.cumsum([0, *(one.n_beams for one in recordings)])
-    sensors = np.cumsum([0, *(len(one.T_base_sensor) for one in recordings)])
-    keyframes = np.cumsum([0, *(len(one) for one in sessions)])
-    ends = [one.offset[1:] + first for one, first in zip(recordings, beams, strict=False)]
+    recordings = [part.recording for part in sessions]
+    beams = np.cumsum([0, *(part.n_beams for part in recordings)])
+    sensors = np.cumsum([0, *(len(part.T_base_sensor) for part in recordings)])
+    keyframes = np.cumsum([0, *(len(part) for part in sessions)])
+    ends = [part.offset[1:] + first for part, first in zip(recordings, beams, strict=False)]
     recording = replace(
         recordings[0],
-        stamp_ns=np.concatenate([one.stamp_ns for one in recordings]),
+        stamp_ns=np.concatenate([part.stamp_ns for part in recordings]),
         offset=np.concatenate([np.zeros(1, np.int64), *ends]),
-        points=np.concatenate([one.points for one in recordings]),
-        hit=np.concatenate([one.hit for one in recordings]),
-        T_base_sensor=np.concatenate([one.T_base_sensor for one in recordings]),
+        points=np.concatenate([part.points for part in recordings]),
+        hit=np.concatenate([part.hit for part in recordings]),
+        T_base_sensor=np.concatenate([part.T_base_sensor for part in recordings]),
         sensor=np.concatenate(
-            [one.sensor + first for one, first in zip(recordings, sensors, strict=False)],
+            [part.sensor + first for part, first in zip(recordings, sensors, strict=False)],
             dtype=np.int32,
             casting="same_kind",
         ),
     )
     return Keyframes(
         recording,
-        np.concatenate([one.scans for one in sessions]),
-        np.concatenate([one.poses for one in sessions]),
-        np.concatenate([one.e for one in sessions]),
-        np.concatenate([one.nodes + k for one, k in zip(sessions, keyframes, strict=False)]),
+        np.concatenate([part.scans for part in sessions]),
+        np.concatenate([part.poses for part in sessions]),
+        np.concatenate([part.e for part in sessions]),
+        np.concatenate([part.nodes + k for part, k in zip(sessions, keyframes, strict=False)]),
     )

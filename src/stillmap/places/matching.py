@@ -176,11 +176,11 @@ def match_sweeps(
         nodes: indices into the nodes of the session.
         threads: the result does not depend on it.
     """
-    one, other = reference.session.keyframes, placed.session.keyframes
-    both = join_keyframes([one, other])
+    known, own = reference.session.keyframes, placed.session.keyframes
+    both = join_keyframes([known, own])
     poses = np.concatenate([reference.keyframe_poses, placed.keyframe_poses])
     travelled = travelled_distance(poses)
-    travelled[len(one) :] += SESSION_GAP
+    travelled[len(known) :] += SESSION_GAP
     T = len(poses)
     odometry = LidarOdometry(
         poses, np.zeros((T, 6)), np.zeros((T, 6, 6)), np.full(T, _USUAL_EXPLAINED_3D)
@@ -188,16 +188,16 @@ def match_sweeps(
     closer = SweepLoopCloser(
         both.recording, both.e, odometry, travelled, np.arange(T), _REACH, threads
     )
-    theirs = poses[one.nodes, :3, 3]
+    theirs = poses[known.nodes, :3, 3]
     out = []
     step = max(-(-len(nodes) // _MAX_NODES), 1)
     for node in nodes[::step]:
-        later = len(one) + int(other.nodes[node])
+        later = len(known) + int(own.nodes[node])
         distance = np.linalg.norm(theirs - poses[later, :3, 3], axis=1)
         nearest = int(np.argmin(distance))
         if distance[nearest] > _REACH:
             continue
-        earlier = int(one.nodes[nearest])
+        earlier = int(known.nodes[nearest])
         closure = closer.verify(earlier, later, se2.inverse(poses[earlier]) @ poses[later], *std)
         verdict = Verdict.CONTRADICTS if closure.rejected else Verdict.FITS
         out.append(KeyframeMatch(node, nearest, closure, verdict))

@@ -80,9 +80,9 @@ def merge_sessions(
         if place is not None:
             frame, options = job.frame or place.frame, _adopt_cells(job.options, place)
             job = replace(job, frame=frame, options=options)
-        _check_job(job, [*order, *(one.name for one in job.sessions)])
+        _check_job(job, [*order, *(session.name for session in job.sessions)])
         sessions = prepare_sessions(job.sessions, job.options, job.odometry, folder, progress)
-        order += [one.name for one in sessions]
+        order += [session.name for session in sessions]
         place, refused = _grow(place, sessions, job, threads, progress)
         refusals += refused
         if len(place.sessions) < 2:
@@ -91,8 +91,8 @@ def merge_sessions(
             )
         if job.frame is not None:
             place = update_evidence(_reframe(place, job.frame), threads)
-        for one in refused:
-            shutil.rmtree(folder / "sessions" / one.name)
+        for refusal in refused:
+            shutil.rmtree(folder / "sessions" / refusal.name)
         progress("merging", 0, 0, 0)
         result = finish_place(place, refusals, order, job.map_state)
         write_place(folder, result, job.options, job.map_state)
@@ -104,8 +104,8 @@ def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[PlaceSes
     if job.base is None:
         return None, [], []
     place, refusals, order = read_place(job.base)
-    for one in place.sessions:
-        name = one.session.name
+    for placed in place.sessions:
+        name = placed.session.name
         copy_session(job.base / "sessions" / name, folder / "sessions" / name)
     return place, refusals, order
 
@@ -143,10 +143,10 @@ def _grow(
     for number, seed in enumerate(sessions):
         cell = cell_size(job.options, seed.dimension)
         start = start_place(seed, job.options.slam.resolution, cell, threads)
-        others = [one for one in sessions if one is not seed]
-        found = _add_all(start, others, threads, progress)
-        if best is None or len(found[0].sessions) > len(best[0].sessions):
-            best = found
+        others = [session for session in sessions if session is not seed]
+        grown = _add_all(start, others, threads, progress)
+        if best is None or len(grown[0].sessions) > len(best[0].sessions):
+            best = grown
         # what is left cannot be more than what was found
         if len(best[0].sessions) >= len(sessions) - number - 1:
             break
@@ -175,7 +175,7 @@ def _add_all(
                 pending.remove(session)
                 refusals.pop(session.name, None)
                 grew = True
-    return place, [refusals[one.name] for one in pending]
+    return place, [refusals[session_left.name] for session_left in pending]
 
 
 def _step(progress: Progress, session: Session) -> Callable[[str], None]:
@@ -188,12 +188,12 @@ def _reframe(place: Place, name: str) -> Place:
     Raises:
         InputError: it is not in the place.
     """
-    for one in place.sessions:
-        if one.session.name == name:
-            back = se2.inverse(one.T)
-            moved = place.with_nodes([back @ other.nodes for other in place.sessions])
+    for placed in place.sessions:
+        if placed.session.name == name:
+            back = se2.inverse(placed.T)
+            moved = place.with_nodes([back @ moving.nodes for moving in place.sessions])
             return replace(moved, frame=name)
-    raise _no_frame(name, [one.session.name for one in place.sessions])
+    raise _no_frame(name, [placed.session.name for placed in place.sessions])
 
 
 def _check_job(job: MergeJob, names: Sequence[str]) -> None:
@@ -217,7 +217,7 @@ def _no_frame(name: str, known: Sequence[str]) -> InputError:
 
 
 def _describe_failure(refusals: Sequence[PlaceSession]) -> str:
-    reasons = "; ".join(f"{one.name}: {one.why}" for one in refusals)
+    reasons = "; ".join(f"{refusal.name}: {refusal.why}" for refusal in refusals)
     return f"fewer than two sessions could be placed: {reasons}"
 
 
@@ -259,7 +259,7 @@ def merge(
     if isinstance(sessions, str | os.PathLike):
         raise TypeError("sessions: expected a list of sessions, got one path")
     chosen, (base, others) = to_options(options), _split_base(sessions)
-    taken = [] if base is None else [one.name for one in read_sessions(base)]
+    taken = [] if base is None else [known.name for known in read_sessions(base)]
     job = MergeJob(base, list_sessions(others, taken), chosen, frame, map_state, odometry)
     with report_to(progress, chosen.em.max_iterations) as report:
         if output is not None:
@@ -273,7 +273,9 @@ def _split_base(
     sessions: Sequence[SessionLike],
 ) -> tuple[Path | None, list[Paths | Recording | Result]]:
     """The place that grows, if there is one, and the sessions."""
-    given = [[one] if isinstance(one, str | os.PathLike) else one for one in sessions]
+    given = [
+        [session] if isinstance(session, str | os.PathLike) else session for session in sessions
+    ]
     first = given[0] if given else None
     if isinstance(first, Result) and first.path is not None and len(first.sessions) > 1:
         return first.path, given[1:]
@@ -288,7 +290,7 @@ def _require_apart(output: Path, job: MergeJob) -> None:
     Raises:
         InputError: it does.
     """
-    inputs = [path for one in job.sessions for path in one.parts]
+    inputs = [path for session in job.sessions for path in session.parts]
     for path in inputs if job.base is None else [job.base, *inputs]:
         if output.resolve() in (path.resolve(), *path.resolve().parents):
             raise InputError("is one of the sessions, or holds one", where=str(output))

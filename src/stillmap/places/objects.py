@@ -51,9 +51,9 @@ def write_objects(folder: Path, place: Place) -> None:
     joined = folder / _OBJECTS
     joined.mkdir()
     records = list[dict[str, Any]]()
-    for one in place.sessions:
-        home = folder / "sessions" / one.session.name
-        of_session, clouds = _place_objects(home, one, place.local_frame)
+    for placed in place.sessions:
+        home = folder / "sessions" / placed.session.name
+        of_session, clouds = _place_objects(home, placed, place.local_frame)
         for record in of_session:
             number = len(records)
             if cloud := clouds.get(f"{record['id']:04d}.ply"):
@@ -64,7 +64,7 @@ def write_objects(folder: Path, place: Place) -> None:
 
 
 def _place_objects(
-    home: Path, one: PlacedSession, frame: LocalFrame
+    home: Path, placed: PlacedSession, frame: LocalFrame
 ) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
     """Write the objects of a session; returns their records, and their clouds by name."""
     source, target = home / "state" / _ORIGINAL, home / _OBJECTS
@@ -72,7 +72,7 @@ def _place_objects(
         return [], {}
     target.mkdir()
     # objects are kept in the map frame of the result
-    T = one.between_maps(fit_alignment(one.session.node_poses, one.nodes), frame)
+    T = placed.between_maps(fit_alignment(placed.session.node_poses, placed.nodes), frame)
     records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
     _write_records(target / _LIST, records)
     clouds = {path.name: _transform_cloud(path, T) for path in sorted(source.glob("*.ply"))}

@@ -79,12 +79,12 @@ def optimize_nodes(
     chain, loops = join_constraints(sessions, ties)
     max_chi2 = MAX_CHI2[sessions[0].dimension]
     everything = np.concatenate(start)
-    found = pose_graph.optimize_poses(everything, chain, loops, max_chi2)
-    agree = pose_graph.squared_mahalanobis(found, loops) <= max_chi2
+    poses = pose_graph.optimize_poses(everything, chain, loops, max_chi2)
+    agree = pose_graph.squared_mahalanobis(poses, loops) <= max_chi2
     kept = [loop for loop, agrees in zip(loops, agree.tolist(), strict=True) if agrees]
-    found = pose_graph.optimize_poses(found, chain, kept)
+    poses = pose_graph.optimize_poses(poses, chain, kept)
     ends = np.cumsum([len(nodes) for nodes in start])
-    return np.split(found, ends[:-1]), agree
+    return np.split(poses, ends[:-1]), agree
 
 
 def place_scans(session: Session, T: Float, nodes: Float) -> Float:
@@ -103,12 +103,12 @@ def fit_alignment(session_poses: Float, place_poses: Float) -> Float:
     place, in the sense of least squares of positions and of the ends of their axes."""
     D = session_poses.shape[-1] - 1
     tips = np.concatenate([np.zeros((D, 1)), _LEVER * np.eye(D)], axis=1)
-    one, other = (
+    ours, theirs = (
         np.swapaxes(T[:, :D, :D] @ tips + T[:, :D, D:], 1, 2).reshape(-1, D)
         for T in (session_poses, place_poses)
     )
-    centre, their_centre = one.mean(axis=0), other.mean(axis=0)
-    U, _, V = np.linalg.svd((other - their_centre).T @ (one - centre))
+    centre, their_centre = ours.mean(axis=0), theirs.mean(axis=0)
+    U, _, V = np.linalg.svd((theirs - their_centre).T @ (ours - centre))
     sign = np.ones(D)
     sign[-1] = np.sign(np.linalg.det(U @ V))
     T = np.eye(D + 1)
@@ -220,7 +220,9 @@ class Place(ShortRepr):
     def local_frame(self) -> LocalFrame:
         """Its frame, in the map frame of the result of the session that has its frame."""
         named = self.frame or self.sessions[0].session.name
-        return next(one.session.frame for one in self.sessions if one.session.name == named)
+        return next(
+            placed.session.frame for placed in self.sessions if placed.session.name == named
+        )
 
     @property
     def dimension(self) -> int:
@@ -229,12 +231,12 @@ class Place(ShortRepr):
 
     def in_time(self) -> list[int]:
         """Indices of the sessions in the order of their first stamps; ties as they were merged."""
-        first = [int(one.session.stamp_ns[0]) for one in self.sessions]
+        first = [int(placed.session.stamp_ns[0]) for placed in self.sessions]
         return sorted(range(len(first)), key=lambda k: first[k])
 
     def with_nodes(self, nodes: Sequence[Float]) -> "Place":
         """The place with other poses of the nodes of every session."""
-        moved = [replace(one, nodes=of) for one, of in zip(self.sessions, nodes, strict=True)]
+        moved = [replace(placed, nodes=of) for placed, of in zip(self.sessions, nodes, strict=True)]
         return replace(self, sessions=moved)
 
 
@@ -244,19 +246,19 @@ def update_evidence(place: Place, threads: int, max_motion: float = MAX_MOTION) 
     max_motion: cells, up to which evidence holds.
     """
     limit = max_motion * min(place.resolution, place.voxel_size)
-    sessions = [_measure(one, place, limit, threads) for one in place.sessions]
+    sessions = [_measure(placed, place, limit, threads) for placed in place.sessions]
     return replace(place, sessions=sessions)
 
 
-def _measure(one: PlacedSession, place: Place, limit: float, threads: int) -> PlacedSession:
-    poses = one.keyframe_poses
-    if one.measured_at is not None:
-        moved = np.linalg.norm((poses - one.measured_at)[:, :-1, -1], axis=1)
+def _measure(placed: PlacedSession, place: Place, limit: float, threads: int) -> PlacedSession:
+    poses = placed.keyframe_poses
+    if placed.measured_at is not None:
+        moved = np.linalg.norm((poses - placed.measured_at)[:, :-1, -1], axis=1)
         if moved.max() <= limit:
-            return one
-    session = one.session
+            return placed
+    session = placed.session
     planar = measure_evidence(session.planar, to_planar(session, poses), place.resolution, threads)
     evidence = planar
     if session.dimension == 3:
         evidence = measure_evidence(session.keyframes, poses, place.voxel_size, threads)
-    return replace(one, evidence=evidence, planar_evidence=planar, measured_at=poses)
+    return replace(placed, evidence=evidence, planar_evidence=planar, measured_at=poses)

@@ -178,7 +178,7 @@ def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> Occupancy
         sessions: evidence of each in the plane.
         shown: the state that the map shows, of planar cells.
     """
-    corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    corners = np.concatenate([session.corner for session in sessions]).astype(np.int64)
     edge = sessions[0].edge
     box = bound_box(corners // edge, _LEAST_BLOCKS, _MOST_BLOCKS)
     corners = corners[box.contains(corners // edge)]
@@ -224,8 +224,8 @@ def _draw_tile(
 
     low, shape = tile.low - _REACH, tuple(n + 2 * _REACH for n in tile.shape)
     units = np.zeros((2, *shape), np.uint32)
-    for one in sessions:
-        for total, of_session in zip(units, one.crop(low, shape), strict=True):
+    for session in sessions:
+        for total, of_session in zip(units, session.crop(low, shape), strict=True):
             total += of_session
     hits, passes = to_sums(units)
     at = tuple((shown.place.cells[cells] - low).T)

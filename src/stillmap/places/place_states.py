@@ -301,9 +301,9 @@ def measure_overlap(sessions: Sequence[Evidence], index: int) -> float:
         hits, _ = sessions[index].crop(*tile)
         total += int(hits.sum())
         seen = np.zeros(tile.shape, np.bool_)
-        for k, other in enumerate(sessions):
+        for k, session in enumerate(sessions):
             if k != index:
-                seen |= np.bitwise_or(*other.crop(*tile)) > 0
+                seen |= np.bitwise_or(*session.crop(*tile)) > 0
         known += int(hits[seen].sum())
     return known / max(total, 1)
 
@@ -333,7 +333,7 @@ def iter_tiles(sessions: Sequence[Evidence]) -> Iterator[Tile]:
     """The tiles in which sessions observed anything, in order."""
     D = sessions[0].dimension
     size = BLOCK[D] * _BLOCKS_PER_TILE
-    lows = np.concatenate([one.corner // size * size for one in sessions])
+    lows = np.concatenate([session.corner // size * size for session in sessions])
     for low in np.unique(lows, axis=0).astype(np.int64):
         yield Tile(low, (size,) * D)
 
@@ -345,7 +345,7 @@ def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDAr
     halo = _CANDIDATE_RADIUS[D]
     low, shape = tile.low - halo, tuple(n + 2 * halo for n in tile.shape)
     inner = (slice(halo, -halo),) * D
-    sums = [crop_without_gaps(one, low, shape) for one in sessions]
+    sums = [crop_without_gaps(session, low, shape) for session in sessions]
     at = np.nonzero(_find_candidates([hits for hits, _ in sums], halo)[inner])
     nats = np.empty((2, len(at[0]), len(sessions)), np.float32)
     for s, (hits, passes) in enumerate(sums):

@@ -70,7 +70,7 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
         session: a further one, with the evidence of its planar keyframes in its own frame.
     """
     D = session.dimension
-    known = make_surface_map([one.require_evidence()[1] for one in place], D)
+    known = make_surface_map([placed.require_evidence()[1] for placed in place], D)
     cell = place[0].require_evidence()[1].resolution
     evidence = measure_evidence(session.planar, session.planar.poses, cell, 1)
     own = make_surface_map([evidence], D)
@@ -78,7 +78,7 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
     refused = _doubt(proposed)
     if D == 3 and not _is_excluded(proposed):
         # sweeps are registered in space, which tells more than their planar views
-        rivals = [one.T for one in proposed[1:_MAX_RIVALS]] if refused else []
+        rivals = [rival.T for rival in proposed[1:_MAX_RIVALS]] if refused else []
         return Placement(proposed[0].T, refused=refused, rivals=rivals)
     if refused:
         return Placement(np.eye(3), refused=refused)
@@ -93,7 +93,7 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
 def _is_strong(proposed: list[Hypothesis]) -> bool:
     """Whether the comparison of the maps alone is enough."""
     best = proposed[0].comparison
-    rival = max((other.comparison.score for other in proposed[1:]), default=0.0)
+    rival = max((hypothesis.comparison.score for hypothesis in proposed[1:]), default=0.0)
     few = best.conflict <= _STRONG_CONFLICT * (best.agree + best.conflict)
     return best.agree >= _STRONG_AGREEING and few and rival <= _STRONG_RIVAL * best.score
 
@@ -110,11 +110,11 @@ def _doubt(proposed: list[Hypothesis]) -> str:
     """Why the best alignment is not certain by the comparison of the maps; empty if it is."""
     if not proposed or proposed[0].comparison.agree < _MIN_AGREEING:
         return "no part of it looks like the place"
-    best, others = proposed[0].comparison, proposed[1:]
+    best, rivals = proposed[0].comparison, proposed[1:]
     share = best.conflict / (best.agree + best.conflict)
     if _is_excluded(proposed):
         return f"it contradicts the place: {100 * share:.0f} % of the surfaces that both saw differ"
-    rival = max((other.comparison.score for other in others), default=0.0) / best.score
+    rival = max((hypothesis.comparison.score for hypothesis in rivals), default=0.0) / best.score
     if share > _MAX_CONFLICT * (1.0 - rival / _MAX_RIVAL):
         return (
             f"it may lie in another place: {100 * share:.0f} % of the surfaces that both saw "
@@ -129,10 +129,10 @@ def test_alignment(place: Sequence[PlacedSession], session: Session, T: Float) -
     poses = T @ planar.poses
     matches = {}
     for index in select_references(place, planar, poses):
-        other = place[index]
+        reference = place[index]
         nodes = spread_evenly(len(planar.nodes), _MAX_TESTED)
         matches[index] = match_sessions(
-            other.session.planar, other.planar_poses, planar, poses, PREDICTION_STD, nodes
+            reference.session.planar, reference.planar_poses, planar, poses, PREDICTION_STD, nodes
         )
     return Placement(T, matches)
 
@@ -144,8 +144,8 @@ def select_references(place: Sequence[PlacedSession], planar: Keyframes, poses: 
     """
     xy = poses[planar.nodes, :2, 2]
     near = []
-    for other in place:
-        theirs = other.planar_poses[other.session.planar.nodes, :2, 2]
+    for placed in place:
+        theirs = placed.planar_poses[placed.session.planar.nodes, :2, 2]
         distance = np.linalg.norm(xy[:, None] - theirs[None], axis=2).min(axis=1)
         near.append(distance <= 0.5 * REACH)
     chosen, missing = list[int](), np.ones(len(xy), np.bool_)

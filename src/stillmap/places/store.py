@@ -79,11 +79,15 @@ def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:
     write_arrays(folder, {**of, "poses": keyframes.poses, "e": keyframes.e})
 
 
-def write_placement(home: Path, one: PlacedSession) -> None:
+def write_placement(home: Path, placed: PlacedSession) -> None:
     """Write where a session lies in its place, and its evidence there."""
     state = home / STATE
-    evidence, planar = one.require_evidence()
-    of = {"nodes": one.nodes, "covariance": one.known_covariance, "measured_at": one.measured_at}
+    evidence, planar = placed.require_evidence()
+    of = {
+        "nodes": placed.nodes,
+        "covariance": placed.known_covariance,
+        "measured_at": placed.measured_at,
+    }
     write_arrays(state, of)
     _write_evidence(state / "evidence.npz", evidence)
     if planar is not evidence:
@@ -138,7 +142,7 @@ def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
     """
     run, records = read_run(folder), read_sessions(folder)
     settings = parse(run.get("place"), _Settings, folder / RECORD, HINT)
-    accepted = {one.name: one for one in records if one.accepted}
+    accepted = {record.name: record for record in records if record.accepted}
     order = run["input"].get("sessions")
     if not isinstance(order, list) or not order or sorted(map(str, order)) != sorted(accepted):
         what = "names other sessions than run.json: one of them was changed by hand"
@@ -149,14 +153,14 @@ def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
         _read_placed(folder / "sessions" / name, accepted[name], settings.voxel_size)
         for name in order
     ]
-    if len({one.session.dimension for one in sessions}) != 1:
+    if len({placed.session.dimension for placed in sessions}) != 1:
         raise InputError("has sessions in 2D and in 3D", where=str(folder), hint=HINT)
     # that of the first one stays by itself: its first pose is what the pose graph holds
     frame = None if settings.frame == order[0] else settings.frame
     ties = _read_ties(folder / TIES, sessions)
     place = Place(sessions, ties, settings.resolution, settings.voxel_size, frame)
-    refused = [one for one in records if not one.accepted]
-    return place, refused, [one.name for one in records]
+    refused = [record for record in records if not record.accepted]
+    return place, refused, [record.name for record in records]
 
 
 def _read_placed(home: Path, record: PlaceSession, voxel_size: float) -> PlacedSession:
@@ -279,10 +283,12 @@ def _read_evidence(path: Path, D: int) -> Evidence:
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     D = sessions[0].session.dimension
     *columns, T, covariance = read_npz(path, (*_TIES, "T", "covariance"), _MAX_ARRAY, HINT).values()
-    L, counts = len(columns[0]), np.array([len(one.nodes) for one in sessions])
+    L, counts = len(columns[0]), np.array([len(placed.nodes) for placed in sessions])
     shapes = [(L,)] * 4 + [(L, D + 1, D + 1), (L, 3 * (D - 1), 3 * (D - 1))]
     every = [*columns, T, covariance]
-    if [one.shape for one in every] != shapes or any(one.dtype.kind != "i" for one in columns):
+    if [array.shape for array in every] != shapes or any(
+        column.dtype.kind != "i" for column in columns
+    ):
         raise InputError("is damaged: arrays of other shapes", where=str(path), hint=HINT)
     first, first_node, second, second_node = columns
     for session, node in ((first, first_node), (second, second_node)):
@@ -309,10 +315,12 @@ def write_joined_beams(folder: Path, homes: list[Path]) -> None:
     for labels in every:
         offsets.append(labels.offset[1:] + first)
         first += int(labels.offset[-1])
-    write_npy(folder / "stamp_ns.npy", np.concatenate([one.stamp_ns for one in every]))
+    write_npy(
+        folder / "stamp_ns.npy", np.concatenate([of_session.stamp_ns for of_session in every])
+    )
     write_npy(folder / "offset.npy", np.concatenate(offsets))
-    _write_joined(folder / "p_static.npy", [one.p_static for one in every])
-    _write_joined(folder / "hit.npy", [one.hit for one in every])
+    _write_joined(folder / "p_static.npy", [of_session.p_static for of_session in every])
+    _write_joined(folder / "hit.npy", [of_session.hit for of_session in every])
 
 
 def _write_joined(path: Path, parts: Sequence[NDArray[Any]]) -> None:

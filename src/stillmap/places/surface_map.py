@@ -113,7 +113,7 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     """
     from scipy import ndimage  # slow to load
 
-    corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    corners = np.concatenate([session.corner for session in sessions]).astype(np.int64)
     if not len(corners):  # nothing was seen: one empty tile
         corners = np.zeros((1, 2), np.int64)
     edge = sessions[0].edge
@@ -132,8 +132,8 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
             slice(int(f) // _STEP, int(f + n) // _STEP)
             for f, n in zip(first - low, part, strict=True)
         )
-        for one in sessions:
-            cells = one.crop(first, part)
+        for session in sessions:
+            cells = session.crop(first, part)
             most, least = _pool(cells[0], np.maximum), _pool(cells[1], np.minimum)
             np.maximum(hits[where], most, out=hits[where])
             np.maximum(passes[where], least, out=passes[where])

@@ -126,10 +126,10 @@ class Transforms:
 def _look_up(buffer: Any, target: str, source: str, stamp: int) -> Float | None:
     """(4, 4) T_target_source; None: it is not known at this time."""
     try:
-        found = buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp)).transform
+        transform = buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp)).transform
     except TransformException:
         return None
-    T, t, q = np.eye(4), found.translation, found.rotation
+    T, t, q = np.eye(4), transform.translation, transform.rotation
     T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     T[:3, 3] = t.x, t.y, t.z
     return T if (np.abs(T) < MAX_TRANSLATION).all() else None
