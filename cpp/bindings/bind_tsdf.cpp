@@ -55,13 +55,6 @@ auto blocks(const TsdfVolume& volume) {
   return to_numpy(std::move(out), {n, 3});
 }
 
-void remove_blocks(TsdfVolume& volume, const Cells<3>& cells) {
-  std::vector<Cell<3>> removed(cells.shape(0));
-  for (size_t k = 0; k < removed.size(); ++k) removed[k] = cell_from<3>(cells, k);
-  nb::gil_scoped_release released;
-  volume.remove_blocks(removed);
-}
-
 // Calls visit(index in the box, voxel) for the integrated voxels of a block, x fastest.
 template <class Visit>
 void for_each_voxel(const TsdfVolume::Block& block, const Box<3>& box, Visit&& visit) {
@@ -118,7 +111,6 @@ void bind_tsdf(nb::module_& m) {
       .def_prop_ro("voxel", &TsdfVolume::voxel)
       .def_prop_ro("truncation_front", &TsdfVolume::truncation_front)
       .def_prop_ro("truncation_back", &TsdfVolume::truncation_back)
-      .def_prop_ro("memory_bytes", &TsdfVolume::memory_bytes)
       .def_prop_ro(
           "block_edge", [](const TsdfVolume&) { return TsdfVolume::kEdge; },
           "voxels along the edge of a block")
@@ -131,8 +123,6 @@ void bind_tsdf(nb::module_& m) {
            "Faces seen edge-on or with a standoff <= 0 are skipped.")
       .def("blocks", &blocks,
            "(B, 3) int64: indices of the allocated blocks, in order of allocation.")
-      .def("remove_blocks", &remove_blocks, nb::arg("blocks").noconvert(),
-           "Removes blocks (B, 3) int64 and frees their memory.")
       .def("dense", &dense, nb::arg("first_cell"), nb::arg("shape"),
            "float32 arrays [z, y, x] over a box of voxels: signed distance in metres, positive in "
            "front of the surface, NaN where unobserved; sum of weights.");

@@ -50,30 +50,6 @@ def test_agreement(seed):
     assert {tuple(b) for b in both[1].blocks()} <= {tuple(b) for b in both[0].blocks()}
 
 
-def test_remove_blocks():
-    both = [kernels.TsdfVolume(VOXEL, **REACH) for kernels in (_core, reference)]
-    for one in both:
-        one.integrate(*seen(1))
-    where, before = box(both[0]), len(both[0].blocks())
-    gone = np.array([b for b in both[0].blocks().tolist() if b[0] >= 0 or b[2] > 0])
-    held = both[0].memory_bytes
-    for one in both:
-        one.remove_blocks(np.vstack([gone, [[900, 0, 0]]]))
-    assert len(both[0].blocks()) == before - len(gone) > 10
-    assert both[0].memory_bytes < held
-    metres, weight = both[0].dense(*where)
-    plain_metres, plain_weight = both[1].dense(*where)
-    assert np.sum((weight > 0) != (plain_weight > 0)) <= 2
-    assert np.nanmax(np.abs(metres - plain_metres)) < 2e-6
-    # removed blocks can be integrated again
-    fresh = _core.TsdfVolume(VOXEL, **REACH)
-    for one in (both[0], fresh):
-        one.integrate(*seen(2))
-    first, shape = [int(v) * 8 for v in gone[0]], [8, 8, 8]
-    for one, other in zip(both[0].dense(first, shape), fresh.dense(first, shape), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_bits_do_not_depend_on_threads(threads):
     rng = np.random.default_rng(5)

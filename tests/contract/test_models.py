@@ -1,5 +1,7 @@
 """Models, opened by other programs."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from made_up_rooms import all_round, furnished, looking, photograph, rectangle, sharpest
@@ -19,7 +21,7 @@ CORNERS = np.array([[[230, 30, 40], [20, 200, 60]], [[40, 50, 220], [240, 220, 3
 @pytest.fixture(scope="module")
 def room():
     mesh, views = furnished(), all_round()
-    read = {view.image: photograph(mesh, view, 1) for view in views}.__getitem__
+    read = partial(photograph, mesh, finer=1)
     return bake_texture(mesh, sharpest(mesh, views), views, read, 512)
 
 

@@ -67,13 +67,6 @@ class TsdfVolume:
         cells = np.array(list(self._sums), np.int64).reshape(-1, 3)
         return np.unique(cells // self.block_edge, axis=0)
 
-    def remove_blocks(self, blocks: NDArray[np.int64]) -> None:
-        """As `_core.TsdfVolume`."""
-        removed = {tuple(block) for block in blocks.tolist()}
-        for cell in list(self._sums):
-            if tuple(c // self.block_edge for c in cell) in removed:
-                del self._sums[cell]
-
     def dense(
         self, first_cell: list[int], shape: list[int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -223,18 +223,17 @@ def sample_indices(count: int, max_count: int) -> NDArray[np.int64]:
 
 
 def unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """`np.unique` of the rows of cells (n, 2) and their inverse (n,); faster, as it sorts numbers.
+    """`np.unique` of the rows of cells (n, D) and their inverse (n,); faster, as it sorts numbers.
 
     Returns:
-        (m, 2) different cells, by the first coordinate, then the second; (n,) which each one is.
+        (m, D) different cells, by the first coordinate, then the next; (n,) which each one is.
     """
     if not len(cells):
         return cells, np.zeros(0, np.intp)
     low = cells.min(axis=0)
-    x, y = (cells - low).T
-    wide = int(y.max()) + 1
-    flat, of = np.unique(x * wide + y, return_inverse=True)
-    return np.stack(np.divmod(flat, wide), axis=1) + low, of.reshape(-1)
+    shape = (cells.max(axis=0) - low + 1).tolist()
+    flat, of = np.unique(np.ravel_multi_index(tuple((cells - low).T), shape), return_inverse=True)
+    return np.stack(np.unravel_index(flat, shape), axis=1) + low, of.reshape(-1)
 
 
 Array = NDArray[Any]

@@ -19,16 +19,15 @@ from stillmap.mesh.point_colors import PointColors, color_points
 from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
 from stillmap.mesh.segmentation import DynamicReturns
 from stillmap.mesh.texture import TexturedMesh, bake_texture
-from stillmap.mesh.texturing import TexturedViews, assign_object_views, times_in_view
+from stillmap.mesh.texturing import assign_object_views, times_in_view
 from stillmap.mesh.triangle_mesh import Float, Int32, Mesh, Tell
 from stillmap.mesh.tsdf import build_surface
-from stillmap.mesh.view_selection import apply_gains
+from stillmap.mesh.view_selection import read_with_gains
 from stillmap.mesh.views import (
     UNREADABLE,
     View,
     filter_readable,
     find_views,
-    read_color_image,
 )
 
 Bake = Callable[[Mesh, Int32, list[View]], TexturedMesh]
@@ -42,7 +41,8 @@ class ObjectModel(ShortRepr):
 
     Attributes:
         shape: its surface, and its frame over time.
-        face_views: which view textures each face.
+        assignment: its faces, and which of `views` textures each.
+        views: images in the object's frame: `T_camera_map` is T_camera_object.
         textured: the textured surface.
         T_map_object: (4, 4) pose of the frame at `stamp_ns`.
         stamp_ns: time of this shape.
@@ -50,7 +50,8 @@ class ObjectModel(ShortRepr):
     """
 
     shape: ObjectShape
-    face_views: TexturedViews
+    assignment: ViewAssignment
+    views: list[View]
     textured: TexturedMesh
     T_map_object: Float
     stamp_ns: int
@@ -130,13 +131,13 @@ def build_models(
         if unread:
             left_out[UNREADABLE] = left_out.get(UNREADABLE, 0) + len(unread)
         place, gains = assign_views(mesh, views, inputs, threads, tell("selecting views"))
-        images = apply_gains(inputs.images, views, gains)
+        read = read_with_gains(inputs.images, views, gains)
     progress("baking textures", 0, 0, 0)
     with stages.measure("texture"):
-        bake = partial(bake_texture, read=images.read, texture_size=options.texture_size)
+        bake = partial(bake_texture, read=read, texture_size=options.texture_size)
         shown = place if region is None else place.select(is_inside(place.mesh.centers, region))
         textured = bake(shown.mesh, shown.view, views)
-    background = Background(place, views, partial(read_color_image, images))
+    background = Background(place, views, read)
     with stages.measure("movers"):
         models, returns = [], DynamicReturns.collect(inputs)
         if options.objects:
@@ -172,10 +173,10 @@ def _model_object(
         return None
     parts = {one.object.id for one in tracks if one.object.id != shape.id}
     boxes = [one for one in returns.inputs.boxes if one.box.object_id not in parts]
-    found = assign_object_views(shape, background, boxes, start)
-    textured = bake(found.assignment.mesh, found.assignment.view, found.views)
+    assignment, views = assign_object_views(shape, background, boxes, start)
+    textured = bake(assignment.mesh, assignment.view, views)
     T = shape.frame.T_map_object(shape.seconds)
     first, middle, last = (
         start + round(1e9 * at) for at in (shape.span[0], shape.seconds, shape.span[1])
     )
-    return ObjectModel(shape, found, textured, T, middle, (first, last))
+    return ObjectModel(shape, assignment, views, textured, T, middle, (first, last))

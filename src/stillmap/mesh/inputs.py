@@ -3,22 +3,21 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
 from stillmap.core.camera import Images
-from stillmap.core.recording import Recording, beam_stamps_ns, max_scan_duration_ns
-from stillmap.mesh.range_image import is_row_scanner
+from stillmap.core.recording import Recording, max_scan_duration_ns
+from stillmap.mesh.range_image import has_planar_scans
 from stillmap.mesh.tracked_boxes import TrackedBox
-from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Index, Int64
+from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Index
 from stillmap.tracking import MovingObject
 
 _SCANS_AROUND = 1  # before and after a time, whose beams may be of it
 _WINDOW = 0.06  # s around an image: longer, and untracked movers smear
 _WINDOW_TILTING = 0.15  # s, for planar scans: each row is only a line across the image
 _WINDOW_TRACKED = 0.5  # s, for planar scans of tracked objects, motion-compensated
-_NEVER = np.iinfo(np.int64).max
+_CLOCK_ERROR = 1e-9  # s
 _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), np.zeros)
 
 
@@ -48,6 +47,11 @@ class MeshInputs:
     def images(self) -> Images:
         """The images of the recording; there may be none."""
         return self.recording.images or _NO_IMAGES
+
+    @cached_property
+    def is_planar(self) -> bool:
+        """True if most scans are planar, as those of a tilting laser."""
+        return has_planar_scans(self.deskewed)
 
     @cached_property
     def max_scan_ns(self) -> int:
@@ -82,16 +86,13 @@ class LidarReturns:
 
     Attributes:
         inputs: the recording.
-        is_planar: whether each scan is a single row, as of a tilting laser.
     """
 
     def __init__(self, inputs: MeshInputs) -> None:
-        self.inputs, self.is_planar = inputs, is_row_scanner(inputs.deskewed)
+        self.inputs = inputs
         beams = {one.id: one.beams for one in inputs.objects}
         self._owned = [
-            (one.box, beams[one.box.object_id])
-            for one in inputs.boxes
-            if one.box.object_id in beams
+            (one, beams[one.box.object_id]) for one in inputs.boxes if one.box.object_id in beams
         ]
 
     def near_time(self, stamp_ns: int) -> tuple[Float, Float32]:
@@ -101,26 +102,19 @@ class LidarReturns:
             (n, 3) metres in the map frame, and P(static) (n,).
         """
         inputs, deskewed = self.inputs, self.inputs.deskewed
-        window = _WINDOW_TILTING if self.is_planar else _WINDOW
-        tracked = max(_WINDOW_TRACKED, window) if self.is_planar else window
-        reach, stamps = 1e9 * tracked + inputs.max_scan_ns, deskewed.stamp_ns
-        start = int(np.searchsorted(stamps, stamp_ns - reach))
-        stop = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
-        first, last = deskewed.offset[[start, stop]]
-        at_ns = beam_stamps_ns(inputs.recording, slice(start, stop))
-        apart = np.abs(at_ns - stamp_ns)
+        window = _WINDOW_TILTING if inputs.is_planar else _WINDOW
+        tracked = _WINDOW_TRACKED if inputs.is_planar else window
+        now = 1e-9 * (stamp_ns - inputs.start_ns)
+        scans = inputs.scans_within(now - tracked, now + tracked)
+        beams = np.arange(deskewed.offset[scans.start], deskewed.offset[scans.stop])
+        away = np.abs(inputs.seconds_of(beams) - now)
         # at least the nearest, as scans without per-beam times share one stamp
-        near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
-        if tracked > window:
-            near |= (apart <= int(1e9 * tracked)) & self._on_dynamic_object[first:last]
-        kept = np.flatnonzero(deskewed.hit[first:last] & near)
-        beams = int(first) + kept
-        ends = np.empty((len(beams), 3))
-        bounds = np.searchsorted(beams, deskewed.offset[start : stop + 1])
-        for scan, (low, high) in zip(range(start, stop), pairwise(bounds), strict=True):
-            T = inputs.T_map_sensor[scan]
-            ends[low:high] = deskewed.points[beams[low:high]] @ T[:3, :3].T + T[:3, 3]
-        self._compensate_motion(ends, beams, at_ns[kept], stamp_ns)
+        near = away <= max(window, float(away.min(initial=np.inf))) + _CLOCK_ERROR
+        if inputs.is_planar:
+            near |= (away <= tracked) & self._on_dynamic_object[beams]
+        beams = beams[deskewed.hit[beams] & near]
+        ends = deskewed.end_points(beams, inputs.poses)
+        self._compensate_motion(ends, beams, now)
         return ends, inputs.p_static[beams]
 
     @cached_property
@@ -132,14 +126,9 @@ class LidarReturns:
             out[owned] = p_static[owned] < 0.5
         return out
 
-    def _compensate_motion(self, ends: Float, beams: Index, at_ns: Int64, stamp_ns: int) -> None:
+    def _compensate_motion(self, ends: Float, beams: Index, now: float) -> None:
         """Moves end points (n, 3) on tracked objects along the tracks to a time; in place."""
-        start_ns = self.inputs.start_ns
         for box, owned in self._owned:
-            if not len(owned) or not len(beams) or owned[-1] < beams[0] or owned[0] > beams[-1]:
-                continue
-            place = np.searchsorted(owned, beams)
-            mine = np.flatnonzero(owned[np.minimum(place, len(owned) - 1)] == beams)
-            then = box.center_at(np.asarray(1e-9 * (at_ns[mine] - start_ns), np.float64))
-            now = box.center_at(np.array([1e-9 * (stamp_ns - start_ns)]))
-            ends[mine, :2] += now - then
+            first, last = np.searchsorted(owned, beams[[0, -1]]) if len(beams) else (0, -1)
+            mine = np.flatnonzero(np.isin(beams, owned[first : last + 1]))
+            ends[mine, :2] += box.motion_until(now, self.inputs.seconds_of(beams[mine]))

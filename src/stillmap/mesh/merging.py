@@ -82,7 +82,7 @@ def merge_tracks(tracks: Sequence[ObjectTrack], returns: DynamicReturns) -> list
     """
     n = len(tracks)
     fast = np.array([one.box.is_fast for one in tracks], np.bool_)
-    if returns.is_planar or not fast.any():
+    if returns.inputs.is_planar or not fast.any():
         return [[one] for one in tracks]
     scans = list(_cluster_scans(tracks, fast, returns))
     counts = count_pairs(scans, n)

@@ -181,15 +181,15 @@ class Background:
     Args:
         place: the surface, and which of `views` textures each face.
         views: images and their poses.
-        read: (h, w, 3) the image of a view; None: it is damaged.
+        read: (h, w, 3) the image of a view.
     """
 
     def __init__(
-        self, place: ViewAssignment, views: Sequence[View], read: Callable[[View], Image | None]
+        self, place: ViewAssignment, views: Sequence[View], read: Callable[[View], Image]
     ) -> None:
         self._place, self.views = place, views
         self._buffer = lru_cache(_CACHED_BUFFERS)(self._render)
-        # (h, w, 3) by the number of a view; None: it is damaged
+        # (h, w, 3) by the number of a view
         self.image = lru_cache(_CACHED_IMAGES)(lambda number: read(views[number]))
 
     def is_unoccluded(self, number: int, points: Float) -> Bool:
@@ -210,8 +210,7 @@ class Background:
         """
         view, out = self.views[number], np.full(len(points), np.nan, np.float32)
         at = view.to_camera(points)
-        mine = self.image(number)
-        if mine is None or not len(points) or not len(self._place.mesh):
+        if not len(points) or not len(self._place.mesh):
             return out
         buffer = self._buffer(number)
         face = sample_buffer(buffer.face, buffer, at).astype(np.intp)
@@ -220,14 +219,12 @@ class Background:
         source[~ok | (source == number)] = -1
         for other in np.unique(source[source >= 0]).tolist():
             image, some = self.image(other), np.flatnonzero(source == other)
-            if image is None:
-                continue
             z = sample_buffer(buffer.depth, buffer, at[some])
             behind = view.to_map(at[some] * (z / at[some, 2])[:, None])
             there, ok = project(self.views[other].camera, self.views[other].to_camera(behind))
             ok &= is_in_image(self.views[other].camera, there)
             some, there = some[ok], there[ok]
-            shown = sample_bilinear(mine, here[some])
+            shown = sample_bilinear(self.image(number), here[some])
             off = [
                 np.linalg.norm(shown - sample_bilinear(image, there + d), axis=1) for d in _SHIFTS
             ]

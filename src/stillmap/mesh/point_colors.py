@@ -3,26 +3,24 @@ images near their time, into which they are moved along their track."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from stillmap.core import arrays
-from stillmap.core.camera import project
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import Background
-from stillmap.mesh.segmentation import IMAGE_WINDOW, NO_OWNER, DynamicReturns
+from stillmap.mesh.segmentation import IMAGE_WINDOW, DynamicReturns
 from stillmap.mesh.texture import GRAY, TexturedMesh, TextureSampler, avoid_gray, sample_bilinear
 from stillmap.mesh.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN, TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Image, Index, Tell, no_tell
+from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
 from stillmap.mesh.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.views import View
-from stillmap.mesh.visibility import IMAGE_MARGIN, NEAR
+from stillmap.mesh.visibility import NEAR, project_inside
 
 _MAX_SURFACE_DISTANCE = 0.1  # m of a static point from the surface
 _OUTLINE_INSET = 0.02  # m inside an object's outline, where an image may show the background
@@ -73,7 +71,7 @@ def color_points(
     delay = recording.allocate_per_beam(np.float32)
     for block in arrays.iter_blocks(delay):
         delay[block] = np.inf
-    tracked = TrackedReturns.collect(returns)
+    tracked = returns.tracked()
     for number in range(len(background.views)):
         color_moving(out, delay, tracked, number, background)
         inputs.deskewed.release_pages(inputs.p_static, out, delay)
@@ -98,136 +96,91 @@ def _color_static(
     """Colors the static end points of a chunk of scans; in place."""
     beams = chunk.beams
     static = inputs.deskewed.hit[beams] & (inputs.p_static[beams] >= DYNAMIC_BELOW)
-    numbers = np.flatnonzero(static)
-    scan = np.searchsorted(chunk.offset, numbers, side="right") - 1 + chunk.scans.start
-    parts = [slice(k, k + _POINTS_PER_BLOCK) for k in range(0, len(numbers), _POINTS_PER_BLOCK)]
+    numbers = beams.start + np.flatnonzero(static)
+    parts = [numbers[k : k + _POINTS_PER_BLOCK] for k in range(0, len(numbers), _POINTS_PER_BLOCK)]
 
-    def sample(part: slice) -> tuple[slice, Image, Bool]:
-        T = inputs.T_map_sensor[scan[part]]
-        local = inputs.deskewed.points[beams.start + numbers[part]].astype(np.float64)
-        ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
-        return part, *sampler.colors(ends, T[:, :3, 3])
+    def sample(part: Index) -> tuple[Index, Image, Bool]:
+        ends = inputs.deskewed.end_points(part, inputs.poses)
+        sensors = inputs.T_map_sensor[inputs.deskewed.scans_of(part), :3, 3]
+        return part, *sampler.colors(ends, sensors)
 
     for part, colors, known in map_ordered(sample, parts, threads):
-        out[beams.start + numbers[part][known]] = colors[known]
-
-
-class TrackedReturns(NamedTuple):
-    """n dynamic returns on tracked objects, sorted by time.
-
-    Attributes:
-        inputs: the recording.
-        beam: (n,) beam numbers.
-        ends: (n, 3) metres in the map frame.
-        seconds: (n,) times, by the clock of boxes.
-        owner: (n,) number of the object's box.
-    """
-
-    inputs: MeshInputs
-    beam: Index
-    ends: Float
-    seconds: Float
-    owner: Index
-
-    @classmethod
-    def collect(cls, returns: DynamicReturns) -> "TrackedReturns":
-        """All dynamic returns on objects that have a box."""
-        place = {one.box.object_id: number for number, one in enumerate(returns.inputs.boxes)}
-        ids, of = np.unique(returns.owner, return_inverse=True)
-        owner = np.array([place.get(int(one), NO_OWNER) for one in ids], np.intp)[of]
-        kept = np.flatnonzero(returns.is_dynamic & (owner != NO_OWNER))
-        kept = kept[np.argsort(returns.seconds[kept], kind="stable")]
-        seconds, ends = returns.seconds[kept], returns.ends[kept]
-        return cls(returns.inputs, returns.beam[kept], ends, seconds, owner[kept])
-
-    def near_time(self, now: float, window: float) -> "TrackedReturns":
-        """Returns within `window` seconds of a time."""
-        first = int(np.searchsorted(self.seconds, now - window))
-        last = int(np.searchsorted(self.seconds, now + window, side="right"))
-        beam, ends = self.beam[first:last], self.ends[first:last]
-        seconds, owner = self.seconds[first:last], self.owner[first:last]
-        return TrackedReturns(self.inputs, beam, ends, seconds, owner)
+        out[part[known]] = colors[known]
 
 
 def color_moving(
-    out: Image, delay: Float32, tracked: TrackedReturns, number: int, background: Background
+    out: Image, delay: Float32, tracked: DynamicReturns, number: int, background: Background
 ) -> None:
     """Colors the tracked points that an image shows, where no image nearer in time does.
 
     Args:
         out: (M, 3), changed.
         delay: (M,) s from each beam to the image of its color; changed.
-        tracked: the dynamic returns.
+        tracked: see `DynamicReturns.tracked`.
         number: of the view.
         background: occludes what is behind it.
     """
     inputs, view = tracked.inputs, background.views[number]
     now = 1e-9 * (view.stamp_ns - inputs.start_ns)
-    seen = tracked.near_time(now, IMAGE_WINDOW)
+    first, last = np.searchsorted(tracked.seconds, [now - IMAGE_WINDOW, now + IMAGE_WINDOW])
+    seen = tracked.take(slice(first, last))
     away = np.abs(seen.seconds - now).astype(np.float32)
-    ends = _move_along_tracks(seen, now)
+    ends, drift = _move_along_tracks(seen, now)
     local = view.to_camera(ends)
-    uv, ok = project(view.camera, local)
-    size = np.array([view.camera.width, view.camera.height])
-    with np.errstate(invalid="ignore"):  # NaN: not in the image
-        ok &= ((uv >= IMAGE_MARGIN) & (uv <= size - 1.0 - IMAGE_MARGIN)).all(axis=1)
+    uv, ok = project_inside(view, local)
     ok &= local[:, 2] > NEAR
-    ok &= _is_inside_outline(seen, local, ok, now)
+    ok &= _depth_inside_outline(seen.owner, local, ok) >= _OUTLINE_INSET + OUTLINE_DRIFT * drift
     ok &= away < delay[seen.beam]
     shown = np.flatnonzero(ok)
     shown = shown[background.is_unoccluded(number, ends[shown])]
     shown = shown[_is_unoccluded_by_others(ends[shown], seen.owner[shown], inputs.boxes, view, now)]
-    image = background.image(number) if len(shown) else None
-    if image is None:
+    if not len(shown):
         return
-    colors = np.rint(sample_bilinear(image, uv[shown]))
+    colors = np.rint(sample_bilinear(background.image(number), uv[shown]))
     out[seen.beam[shown]] = avoid_gray(colors.astype(np.uint8))
     delay[seen.beam[shown]] = away[shown]
 
 
-def _move_along_tracks(seen: TrackedReturns, now: float) -> Float:
-    """(n, 3) end points, each moved with its object to a time."""
-    out = seen.ends.copy()
-    for number in np.unique(seen.owner).tolist():
-        mine, box = seen.owner == number, seen.inputs.boxes[number].box
-        out[mine, :2] += box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
-    return out
+def _move_along_tracks(seen: DynamicReturns, now: float) -> tuple[Float, Float]:
+    """(n, 3) end points, each moved with its object to a time, and (n,) metres of that motion."""
+    out, moved = seen.ends.copy(), np.zeros(len(seen.ends))
+    boxes = {tracked.box.object_id: tracked for tracked in seen.inputs.boxes}
+    for owner in np.unique(seen.owner).tolist():
+        mine = seen.owner == owner
+        motion = boxes[owner].motion_until(now, seen.seconds[mine])
+        out[mine, :2] += motion
+        moved[mine] = np.linalg.norm(motion, axis=1)
+    return out, moved
 
 
-def _is_inside_outline(seen: TrackedReturns, local: Float, shown: Bool, now: float) -> Bool:
-    """(n,) whether points lie inside the outline of their object in an image.
-
-    By `_OUTLINE_INSET`, and by a share `OUTLINE_DRIFT` of the object's motion since.
+def _depth_inside_outline(owner: Int32, local: Float, shown: Bool) -> Float:
+    """(n,) metres by which points lie inside the outline of their object in an image.
 
     Args:
-        seen: the returns.
+        owner: (n,) object.
         local: (n, 3) metres in the camera's frame, moved to the time of the image.
         shown: (n,) whether they are in the image.
-        now: s, time of the image.
     """
-    out = np.zeros(len(shown), np.bool_)
-    for number in np.unique(seen.owner[shown]).tolist():
-        mine = np.flatnonzero(shown & (seen.owner == number))
+    out = np.full(len(shown), -np.inf)
+    for number in np.unique(owner[shown]).tolist():
+        mine = np.flatnonzero(shown & (owner == number))
         x, y, z = local[mine].T
-        inside = outline_depth(np.stack([x / z, y / z], axis=1) * np.median(z), _POINT_RADIUS)
-        box = seen.inputs.boxes[number].box
-        way = box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
-        moved = np.linalg.norm(way, axis=1)
-        out[mine] = inside >= _OUTLINE_INSET + OUTLINE_DRIFT * moved
+        plane = np.stack([x / z, y / z], axis=1) * np.median(z)
+        out[mine] = outline_depth(plane, _POINT_RADIUS)
     return out
 
 
 def _is_unoccluded_by_others(
-    points: Float, owner: Index, boxes: Sequence[TrackedBox], view: View, now: float
+    points: Float, owner: Int32, boxes: Sequence[TrackedBox], view: View, now: float
 ) -> Bool:
     """(n,) whether probably no other object stands between a camera and points (n, 3).
 
     Points in an object's box, or near it, count as its own.
     """
     free = np.ones(len(points))
-    for number, tracked in enumerate(boxes):
+    for tracked in boxes:
         for box in boxes_at([tracked], now):
             within = (np.abs(box.local(points)) <= box.half_size + OUTLINE_MARGIN).all(axis=1)
-            rest = np.flatnonzero((owner != number) & ~within)
+            rest = np.flatnonzero((owner != tracked.box.object_id) & ~within)
             free[rest] *= 1.0 - occlusion_probability([box], view.position, points[rest])
     return free >= MIN_P_VISIBLE

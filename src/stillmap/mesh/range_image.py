@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.triangle_mesh import Bool, Float, Index, Int32
@@ -39,8 +39,6 @@ _TESTED_SCANS = 9  # that tell whether scans are planar
 _ROWS_PER_PATCH = 128  # planar scans triangulated together
 _MIN_ROW_STEP = 0.2  # of the median angle between rows: nearer ones are the same row
 _MAX_ROW_STEP = 4.0  # times that angle: farther ones are no neighbors
-_SEAM = 0.2  # rad by which directions are continued beyond a full turn
-_MIN_PERSPECTIVE_COSINE = 0.5  # from the center of a scan to its corners: else not one plane
 
 
 class Patch(NamedTuple):
@@ -187,28 +185,22 @@ def triangulate_scans(
         poses: (T, 4, 4) T_map_base.
         layout: see `find_scan_layout`.
     """
-    T = recording.T_map_sensor(poses)
     row_lengths: dict[tuple[int, int], int] = {}
     for scans in layout.groups:
-        yield partial(_make_patch, recording, T, scans, layout, row_lengths)
+        yield partial(_make_patch, recording, poses, scans, layout, row_lengths)
 
 
 def _make_patch(
     recording: Recording,
-    T_map_sensor: Float,
+    poses: Float,
     scans: Index,
     layout: ScanLayout,
     row_lengths: dict[tuple[int, int], int],
 ) -> Patch:
     beam = np.concatenate([np.arange(recording.offset[t], recording.offset[t + 1]) for t in scans])
-    local = recording.points[beam].astype(np.float64)
-    counts = np.diff(recording.offset)[scans]
-    scan = np.repeat(np.arange(len(scans)), counts)
-    T = T_map_sensor[scans]
-    bounds = pairwise(np.concatenate([[0], np.cumsum(counts)]))
-    points = np.concatenate(
-        [local[i:j] @ one[:3, :3].T + one[:3, 3] for one, (i, j) in zip(T, bounds, strict=True)]
-    )
+    local, points = recording.points[beam].astype(np.float64), recording.end_points(beam, poses)
+    sensor, scan = recording.sensor[scans], np.searchsorted(scans, recording.scans_of(beam))
+    T = poses[scans] @ recording.T_base_sensor[sensor]
     origin = T[scan, :3, 3]
     x, y, z = points.T
     # a return at the sensor itself has no direction
@@ -216,12 +208,12 @@ def _make_patch(
     points[~use] = 0.0  # in no triangle
     directions = beam_directions(local)
     if layout.is_planar:
-        R = recording.T_base_sensor[recording.sensor[scans], :3, :3]
+        R = recording.T_base_sensor[sensor, :3, :3]
         directions = np.einsum("nij,nj->ni", R[scan], directions)
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
         faces = _triangulate_rows(points, use, number, directions)
     else:
-        key = (int(recording.sensor[scans[0]]), len(beam))
+        key = (int(sensor[0]), len(beam))
         if key not in row_lengths:
             row_lengths[key] = find_row_length(directions)
         faces = _triangulate_image(points, use, directions, row_lengths[key], layout.stride)
@@ -285,30 +277,8 @@ def _triangulate_without_grid(use: Bool, directions: Float) -> Int32:
 
 
 def triangulate_directions(directions: Float) -> Int32:
-    """(m, 3) the Delaunay triangulation of unit vectors (n, 3)."""
-    middle = directions.mean(axis=0)
-    middle /= max(float(np.linalg.norm(middle)), 1e-12)
-    if float((directions @ middle).min()) > _MIN_PERSPECTIVE_COSINE:
-        side = np.linalg.svd(middle[None])[2][1:]
-        plane = (directions @ side.T) / (directions @ middle)[:, None]
-        of = np.arange(len(directions))
-    else:
-        plane, of = _unroll(directions)
+    """(m, 3) the Delaunay triangulation of unit vectors (n, 3) on the sphere: their convex hull."""
     try:
-        found = Delaunay(plane).simplices
-    except QhullError:  # all in one line
+        return ConvexHull(directions).simplices.astype(np.int32)
+    except QhullError:  # all in one plane
         return np.zeros((0, 3), np.int32)
-    found = found[np.abs(plane[found].mean(axis=1)[:, 0]) <= np.pi]
-    faces = of[found].astype(np.int32)
-    return np.asarray(faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])])
-
-
-def _unroll(directions: Float) -> tuple[Float, Index]:
-    """Azimuth and elevation, continued beyond a full turn on both sides, and the beam of each."""
-    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
-    elevation = np.arcsin(np.clip(directions[:, 2], -1.0, 1.0))
-    plane, of = np.stack([azimuth, elevation], axis=1), np.arange(len(directions))
-    low, high = azimuth < _SEAM - np.pi, azimuth > np.pi - _SEAM
-    turn = np.array([2.0 * np.pi, 0.0])
-    both = np.concatenate([plane, plane[low] + turn, plane[high] - turn])
-    return both, np.concatenate([of, of[low], of[high]])

@@ -86,7 +86,7 @@ def reconstruct_object(
         return None
     fast = any(one.box.is_fast for one in tracks)
     rigid = fast or any(one.box.is_large for one in tracks)
-    durations = [k * _SWEEP_WINDOW for k in _SWEEP_FACTORS] if returns.is_planar else [0.0]
+    durations = [k * _SWEEP_WINDOW for k in _SWEEP_FACTORS] if returns.inputs.is_planar else [0.0]
     for duration in durations:
         one, span = _best_track(tracks, images, duration, returns)
         frame = ObjectFrame.from_track(one.box)
@@ -98,7 +98,7 @@ def reconstruct_object(
             continue
         now = 0.5 * sum(scan.span)
         shape = None
-        if rigid and not returns.is_planar and len(mesh.vertices) >= _MIN_VERTICES:
+        if rigid and not returns.inputs.is_planar and len(mesh.vertices) >= _MIN_VERTICES:
             shape = _merge_partial_scans(one, own, now, fast, returns)
         shape = shape or ObjectShape(one.object.id, mesh, frame, False, now, scan.span)
         p_dynamic = mean_p_dynamic(shape.mesh, shape.frame, shape.span, returns.inputs)
@@ -151,20 +151,15 @@ def mean_p_dynamic(
     tree = cKDTree(fine.vertices)
     low, high = fine.vertices.min(axis=0) - max_distance, fine.vertices.max(axis=0) + max_distance
     low[2] = max(low[2], _MIN_RETURN_HEIGHT)
-    total, count = 0.0, 0
-    scans = inputs.scans_within(*span)
-    for scan in range(scans.start, scans.stop):  # one by one, to save memory
-        beams = np.arange(deskewed.offset[scan], deskewed.offset[scan + 1])
-        seconds = inputs.seconds_of(beams)
-        then = (seconds >= span[0]) & (seconds <= span[1]) & deskewed.hit[beams]
-        beams, seconds = beams[then], seconds[then]
-        at = frame.to_object(seconds, deskewed.end_points(beams, inputs.poses))
-        some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
-        distance = tree.query(at[some], distance_upper_bound=max_distance)[0]
-        near = inputs.p_static[beams[some[np.isfinite(distance)]]]
-        total += float(near.sum(dtype=np.float64))
-        count += len(near)
-    return 1.0 - total / count if count else float("nan")
+    scans, offset = inputs.scans_within(*span), deskewed.offset
+    beams = np.arange(offset[scans.start], offset[scans.stop])
+    seconds = inputs.seconds_of(beams)
+    then = (seconds >= span[0]) & (seconds <= span[1]) & deskewed.hit[beams]
+    at = frame.to_object(seconds[then], deskewed.end_points(beams[then], inputs.poses))
+    some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
+    distance = tree.query(at[some], distance_upper_bound=max_distance)[0]
+    near = inputs.p_static[beams[then][some[np.isfinite(distance)]]]
+    return 1.0 - float(near.mean(dtype=np.float64)) if len(near) else float("nan")
 
 
 def _merge_partial_scans(
@@ -234,12 +229,9 @@ def _fuse_patches(patches: Sequence[Patch]) -> Mesh:
 
 def object_voxel_size(patches: Sequence[Patch]) -> float:
     """Metres: a little less than the beam spacing on an object, within bounds."""
-    edges = [np.zeros(0)]
-    for patch in patches:
-        corners = patch.points[patch.faces]
-        edges.append(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).ravel())
-    all_edges = np.concatenate(edges)
-    spacing = float(np.median(all_edges)) if len(all_edges) else _MIN_VOXEL
+    corners = np.concatenate([patch.points[patch.faces] for patch in patches])
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    spacing = float(np.median(edges)) if len(edges) else _MIN_VOXEL
     return float(np.clip(_VOXEL_SHARE * spacing, _MIN_VOXEL, _MAX_VOXEL))
 
 

@@ -25,6 +25,7 @@ from stillmap.mesh.segmentation import (
 )
 from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Float, Index, Mesh, remove_small_components
+from stillmap.mesh.triangulation import vertex_normals
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
 _MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface
@@ -85,11 +86,9 @@ class PartialSurface:
     @classmethod
     def from_mesh(cls, mesh: Mesh, sensor: Float, time_offset: float) -> "PartialSurface":
         """With area-weighted vertex normals."""
-        spans = np.repeat(mesh.normals() * mesh.areas()[:, None], 3, axis=0)
-        at, n = mesh.faces.ravel(), len(mesh.vertices)
-        normals = np.stack([np.bincount(at, column, n) for column in spans.T], axis=1)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return cls(mesh, normals / np.maximum(length, 1e-12), sensor, time_offset)
+        spans = (mesh.normals() * mesh.areas()[:, None]).T
+        normals = vertex_normals(spans, mesh.faces, len(mesh.vertices), 0).T
+        return cls(mesh, np.ascontiguousarray(normals), sensor, time_offset)
 
     @cached_property
     def tree(self) -> "cKDTree[None]":

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +13,8 @@ from scipy.spatial import cKDTree
 
 import stillmap._core as _core
 from stillmap.core.camera import project
-from stillmap.core.errors import InputError, import_extra
+from stillmap.core.errors import import_extra
 from stillmap.core.short_repr import ShortRepr
-from stillmap.core.square_box import component_labels
 from stillmap.mesh.triangle_mesh import (
     Bool,
     Float,
@@ -24,10 +24,11 @@ from stillmap.mesh.triangle_mesh import (
     Int32,
     Int64,
     Mesh,
+    planar_areas,
     row_lengths,
     subdivide,
 )
-from stillmap.mesh.views import View, as_color_image
+from stillmap.mesh.views import View
 
 GRAY = (128, 128, 128)  # of faces that no image textures
 GUTTER = 4  # texels around each chart that continue its colors
@@ -49,7 +50,7 @@ class AtlasLayout(NamedTuple):
         uv: (U, 2) texels from a page's left and top edge, centers at halves; 0 on no page.
         page: (F,) int32, -1: no image.
         view: (F,) int32, -1: none.
-        scale: (F,) texels per pixel of the image, along an edge.
+        scale: (N,) texels per pixel of each view, along an edge.
         sizes: (P, 2) int64, width and height of the pages.
     """
 
@@ -76,7 +77,6 @@ class TexturedMesh(ShortRepr):
         page: (F,) int32, -1: gray.
         pages: P images (h, w, 3) uint8, sRGB.
         view: (F,) int32, number of the view on each face, -1: none.
-        unread: one line for each image that could not be read; its faces are gray.
     """
 
     vertices: Float
@@ -85,7 +85,6 @@ class TexturedMesh(ShortRepr):
     page: Int32
     pages: tuple[Image, ...]
     view: Int32
-    unread: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.faces)
@@ -105,32 +104,39 @@ def build_layout(
     Raises:
         MissingExtra: xatlas is not installed.
     """
-    view, pixels = _project_faces(mesh, view_of_face, views)
-    chart = find_charts(mesh, view)
-    textured = np.flatnonzero(chart >= 0)
-    # a copy of each vertex for each chart
-    key = chart[textured, None] * np.int64(len(mesh.vertices)) + mesh.faces[textured]
+    view, shown = _project_faces(mesh, view_of_face, views)
+    textured = np.flatnonzero(view >= 0)
+    # a copy of each vertex for each view
+    key = view[textured, None] * np.int64(len(mesh.vertices)) + mesh.faces[textured]
     key, first, corner = np.unique(key, return_index=True, return_inverse=True)
-    corner = corner.reshape(-1, 3).astype(np.int64)
-    vertex, of_chart = key % max(len(mesh.vertices), 1), key // max(len(mesh.vertices), 1)
-    uv = pixels[textured].reshape(-1, 2)[first]
-    n_charts = int(chart.max(initial=-1)) + 1
+    corner, uv = corner.reshape(-1, 3), shown[textured].reshape(-1, 2)[first]
     room = texture_size - 2 * GUTTER
-    scale = _initial_scales(mesh.areas()[textured], uv[corner], chart[textured], n_charts, room)
-    placed, page, scale = _pack(uv, corner, of_chart, scale, room)
-    return _add_gray_faces(
-        mesh, view, textured, vertex, corner, placed, page, scale[of_chart], texture_size
+    scale = _initial_scales(mesh.areas()[textured], uv[corner], view[textured], views, room)
+    while True:
+        pixels = (uv + 0.5) * scale[key // max(len(mesh.vertices), 1), None]
+        source, faces, at, page = _run_xatlas(pixels, corner, view[textured], room)
+        if page.max(initial=-1) < _MAX_PAGES:
+            break
+        scale = scale * _SHRINK
+    sizes = np.zeros((int(page.max(initial=-1)) + 1, 2), np.int64)
+    np.maximum.at(sizes, page[page >= 0], np.ceil(at[page >= 0]).astype(np.int64) + 2 * GUTTER)
+    sizes = np.minimum(-16 * (-sizes // 16), texture_size)
+    # faces without a place on a page get vertices of their own
+    gray = np.setdiff1d(np.arange(len(mesh)), textured)
+    used, number = np.unique(mesh.faces[gray], return_inverse=True)
+    all_faces = np.empty((len(mesh), 3), np.int32)
+    all_faces[textured], all_faces[gray] = faces, number.reshape(-1, 3) + len(source)
+    page_of_face = np.full(len(mesh), -1, np.int32)
+    page_of_face[textured] = page[faces[:, 0]]
+    return AtlasLayout(
+        np.concatenate([key[source] % max(len(mesh.vertices), 1), used]).astype(np.int32),
+        all_faces,
+        np.concatenate([at + GUTTER, np.zeros((len(used), 2))]),
+        page_of_face,
+        np.where(page_of_face >= 0, view, np.int32(-1)),
+        scale,
+        sizes,
     )
-
-
-def find_charts(mesh: Mesh, view: Int32) -> Int64:
-    """(F,) int64 number of each face's chart: adjacent faces with one view; -1 without one."""
-    pairs = mesh.adjacent_faces()
-    pairs = pairs[(view[pairs[:, 0]] == view[pairs[:, 1]]) & (view[pairs[:, 0]] >= 0)]
-    out = np.full(len(mesh), -1, np.int64)
-    chart = component_labels(pairs, len(mesh))[view >= 0]
-    out[view >= 0] = np.unique(chart, return_inverse=True)[1]
-    return out
 
 
 def _project_faces(mesh: Mesh, view_of_face: Int32, views: list[View]) -> tuple[Int32, Float]:
@@ -145,67 +151,43 @@ def _project_faces(mesh: Mesh, view_of_face: Int32, views: list[View]) -> tuple[
         used, at = np.unique(mesh.faces[mine], return_inverse=True)
         uv, ok = project(one.camera, one.to_camera(mesh.vertices[used]))
         corners = uv[at.reshape(-1, 3)]
-        shown = ok[at.reshape(-1, 3)].all(axis=1) & (_areas(corners) > _MIN_AREA)
+        shown = ok[at.reshape(-1, 3)].all(axis=1) & (planar_areas(corners) > _MIN_AREA)
         pixels[mine[shown]] = corners[shown]
         view[mine[~shown]] = -1
     return view, pixels
 
 
-def _areas(corners: Float) -> Float:
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _initial_scales(area: Float, corners: Float, chart: Int64, n_charts: int, room: int) -> Float:
-    """(C,) texels per pixel of each chart: 1, less where pixels are finer than `_MIN_TEXEL`, where
-    a chart exceeds a page, and where all of them exceed the pages."""
-    pixels = np.bincount(chart, _areas(corners), n_charts)
-    metres = np.bincount(chart, area, n_charts)
-    scale = np.minimum(1.0, np.sqrt(metres / np.maximum(pixels, 1e-300)) / _MIN_TEXEL)
-    low, high = np.full((n_charts, 2), np.inf), np.full((n_charts, 2), -np.inf)
-    np.minimum.at(low, chart, corners.min(axis=1))
-    np.maximum.at(high, chart, corners.max(axis=1))
-    scale = np.minimum(scale, (room - 3.0) / np.maximum((high - low).max(axis=1), 1.0))
+def _initial_scales(
+    area: Float, corners: Float, view: Int32, views: list[View], room: int
+) -> Float:
+    """(N,) texels per pixel of each view: 1, less where pixels are finer than `_MIN_TEXEL`, where
+    an image exceeds a page, and where all charts exceed the pages."""
+    pixels = np.bincount(view, planar_areas(corners), len(views))
+    metres = np.bincount(view, area, len(views))
+    edge = np.array([max(one.camera.width, one.camera.height) for one in views])
+    scale = np.minimum(np.sqrt(metres / np.maximum(pixels, 1e-300)) / _MIN_TEXEL, 1.0)
+    scale = np.minimum(scale, (room - 3.0) / np.maximum(edge, 1))
     texels = float(np.sum(pixels * scale * scale))
-    fit = np.sqrt(_FILL * _MAX_PAGES * room * room / max(texels, 1.0))
-    return np.asarray(scale * min(1.0, float(fit)))
+    return scale * min(1.0, float(np.sqrt(_FILL * _MAX_PAGES * room * room / max(texels, 1.0))))
 
 
-def _pack(
-    uv: Float, corner: Int64, of_chart: Int64, scale: Float, room: int
-) -> tuple[Float, Int64, Float]:
-    """Positions (n, 2) in texels and pages (n,) of the vertices of all charts, and the final scales
-    of the charts (C,).
+def _run_xatlas(
+    uv: Float, corner: Index, view: Int32, room: int
+) -> tuple[Index, Int32, Float, Int32]:
+    """Packs charts, which are connected faces of one view: vertices (U,) that it copies, faces
+    (F, 3) of the copies, and their positions (U, 2) in texels and pages (U,); -1: none.
 
-    At scale 1, texel centers coincide with pixel centers of the image.
-    """
-    while True:
-        pixels = (uv + 0.5) * scale[of_chart, None]
-        low = np.full((len(scale), 2), np.inf)
-        np.minimum.at(low, of_chart, pixels)
-        local = pixels - np.floor(low)[of_chart]
-        at, page = _run_xatlas(local, corner, of_chart, room)
-        if page.max(initial=-1) < _MAX_PAGES:
-            break
-        scale = scale * _SHRINK
-    low = np.full((len(scale), 2), np.inf)
-    np.minimum.at(low, of_chart, at)
-    return local + np.rint(low - 0.5)[of_chart] + GUTTER, page, scale
-
-
-def _run_xatlas(local: Float, corner: Int64, of_chart: Int64, room: int) -> tuple[Float, Int64]:
-    """Packed positions of the vertices of charts, (n, 2) texels, and their pages (n,); -1: none.
-
-    xatlas stretches charts by less than a texel, which the caller undoes.
+    xatlas stretches charts by less than a texel, which is undone.
     """
     if not len(corner):
-        return np.zeros((0, 2)), np.zeros(0, np.int64)
+        empty = np.zeros(0, np.int32)
+        return np.zeros(0, np.intp), empty.reshape(0, 3), np.zeros((0, 2)), empty
     xatlas: Any = import_extra("xatlas", "mesh.glb", "textured", group="mesh")
     atlas = xatlas.Atlas()
     atlas.add_uv_mesh(
-        np.ascontiguousarray(local, np.float32),
+        np.ascontiguousarray(uv, np.float32),
         np.ascontiguousarray(corner, np.uint32),
-        np.ascontiguousarray(of_chart[corner[:, :1]], np.uint32),
+        np.ascontiguousarray(view[:, None], np.uint32),
     )
     pack = xatlas.PackOptions()
     pack.resolution = room
@@ -214,47 +196,21 @@ def _run_xatlas(local: Float, corner: Int64, of_chart: Int64, room: int) -> tupl
     pack.bilinear = True
     pack.rotate_charts = pack.rotate_charts_to_axis = False
     atlas.generate(xatlas.ChartOptions(), pack)
-    vertex, _, uv = atlas.get_mesh(0)
-    at, page = np.zeros(local.shape), np.full(len(local), -1, np.int64)
-    at[vertex] = uv * np.array([atlas.width, atlas.height])
-    page[vertex] = atlas.get_mesh_vertex_assignment(0)[0].astype(np.int32)
-    return at, page
+    vertex, faces, at = atlas.get_mesh(0)
+    page, chart = (a.astype(np.int32) for a in atlas.get_mesh_vertex_assignment(0))
+    chart[page < 0] = chart.max() + 1
+    texels = at.astype(np.float64) * np.array([atlas.width, atlas.height])
+    # charts are as they were, shifted by whole texels, so that at scale 1 texels are pixels
+    local, corner_of = uv[vertex], partial(_chart_corners, chart=chart)
+    shift = np.rint(corner_of(texels) - 0.5) - np.floor(corner_of(local))
+    return vertex.astype(np.intp), faces.astype(np.int32), local + shift[chart], page
 
 
-def _add_gray_faces(
-    mesh: Mesh,
-    view: Int32,
-    textured: Index,
-    vertex: Int64,
-    corner: Int64,
-    placed: Float,
-    page: Int64,
-    scale: Float,
-    texture_size: int,
-) -> AtlasLayout:
-    """The layout of all faces; those without a place on a page get vertices of their own."""
-    there = (page[corner] >= 0).all(axis=1)
-    textured, corner = textured[there], corner[there]
-    P = int(page.max(initial=-1)) + 1
-    sizes = np.zeros((P, 2), np.int64)
-    np.maximum.at(sizes, page[page >= 0], np.ceil(placed[page >= 0]).astype(np.int64))
-    sizes = np.minimum(-16 * (-(sizes + GUTTER) // 16), texture_size)
-    faces = np.zeros((len(mesh), 3), np.int64)
-    page_of_face, scale_of_face = np.full(len(mesh), -1, np.int32), np.ones(len(mesh))
-    faces[textured] = corner
-    page_of_face[textured], scale_of_face[textured] = page[corner[:, 0]], scale[corner[:, 0]]
-    gray = page_of_face < 0
-    used, at = np.unique(mesh.faces[gray], return_inverse=True)
-    faces[gray] = at.reshape(-1, 3) + len(vertex)
-    return AtlasLayout(
-        np.concatenate([vertex, used]).astype(np.int32),
-        faces.astype(np.int32),
-        np.concatenate([placed, np.zeros((len(used), 2))]),
-        page_of_face,
-        np.where(gray, -1, view).astype(np.int32),
-        scale_of_face,
-        sizes,
-    )
+def _chart_corners(positions: Float, chart: Int32) -> Float:
+    """(C, 2) lowest coordinates of each chart."""
+    out = np.full((int(chart.max()) + 1, 2), np.inf)
+    np.minimum.at(out, chart, positions)
+    return out
 
 
 _TEXELS_PER_BLOCK = 1 << 17
@@ -265,7 +221,7 @@ def bake_texture(
     mesh: Mesh,
     view_of_face: Int32,
     views: list[View],
-    read: Callable[[int], NDArray[Any]],
+    read: Callable[[View], Image],
     texture_size: int = 4096,
 ) -> TexturedMesh:
     """A mesh textured by images, one of which is in memory at a time.
@@ -274,7 +230,7 @@ def bake_texture(
         mesh: V vertices, F faces.
         view_of_face: (F,) int32, view of each face, -1: none; it stays gray.
         views: with calibrations that `calibration_error` accepts.
-        read: the image of a number, see `Images.read`; (h, w[, 3]) uint8.
+        read: (h, w, 3) the image of a view.
         texture_size: maximum edge of a page, texels.
 
     Raises:
@@ -283,24 +239,16 @@ def bake_texture(
     layout = build_layout(mesh, view_of_face, views, texture_size)
     pages = [np.full((h, w, 3), GRAY[0], np.uint8) for w, h in layout.sizes.tolist()]
     filled = [np.zeros(page.shape[:2], np.bool_) for page in pages]
-    vertices, view = mesh.vertices[layout.vertex], layout.view.copy()
-    unread: list[str] = []
-    for number in np.unique(view[view >= 0]).tolist():
-        one, faces = views[number], np.flatnonzero(layout.view == number)
-        try:
-            image = as_color_image(read(one.image), one)
-        except InputError as error:
-            unread.append(str(error))
-            view[faces] = -1
-            image = np.broadcast_to(np.uint8(GRAY[0]), (1, 1, 3))
-        _bake_view(pages, filled, layout, vertices, faces, one, image)
+    vertices = mesh.vertices[layout.vertex]
+    for number in np.unique(layout.view[layout.view >= 0]).tolist():
+        _bake_view(pages, filled, layout, vertices, number, views[number], read(views[number]))
     for page, mask in zip(pages, filled, strict=True):
         fill_gutters(page, mask, GUTTER)
     uv = layout.uv.copy()
     for page_number, size in enumerate(layout.sizes):
         on_page = np.unique(layout.faces[layout.page == page_number])
         uv[on_page] /= size
-    return TexturedMesh(vertices, layout.faces, uv, layout.page, tuple(pages), view, tuple(unread))
+    return TexturedMesh(vertices, layout.faces, uv, layout.page, tuple(pages), layout.view)
 
 
 def _bake_view(
@@ -308,31 +256,27 @@ def _bake_view(
     filled: list[Bool],
     layout: AtlasLayout,
     vertices: Float,
-    faces: Index,
+    number: int,
     view: View,
     image: Image,
 ) -> None:
-    """Bakes the faces of one view, those of each page and scale together."""
-    times = np.floor(np.log2(1.0 / layout.scale[faces]) + 0.5).astype(np.int64)
-    if image.size == 3:
-        times[:] = 0
-    for level in np.unique(times):
-        smaller = np.ascontiguousarray(image) if level == 0 else downsample(image, int(level))
-        for number in np.unique(layout.page[faces]):
-            mine = faces[(times == level) & (layout.page[faces] == number)]
-            h, w = filled[number].shape
-            corners = layout.faces[mine]
-            texel, of, weight = _core.rasterise_texels(layout.uv[corners], w, h)
-            places = view.to_camera(vertices[corners].reshape(-1, 3)).reshape(-1, 3, 3)
-            flat, mask = pages[number].reshape(-1, 3), filled[number].reshape(-1)
-            for first in range(0, len(texel), _TEXELS_PER_BLOCK):
-                part = slice(first, first + _TEXELS_PER_BLOCK)
-                a, b, c = np.moveaxis(places[of[part]], 1, 0)
-                j, k = weight[part, :1], weight[part, 1:]
-                uv, _ = project(view.camera, a + j * (b - a) + k * (c - a))
-                color = sample_bilinear(smaller, (uv + 0.5) * 0.5**level - 0.5)
-                flat[texel[part]] = np.rint(color)
-                mask[texel[part]] = True
+    """Bakes the faces of the view with a number, page by page."""
+    level = max(round(np.log2(1.0 / layout.scale[number])), 0)
+    smaller = downsample(image, level)
+    of_view = layout.view == number
+    for page in np.unique(layout.page[of_view]).tolist():
+        corners = layout.faces[of_view & (layout.page == page)]
+        h, w = filled[page].shape
+        texel, of, weight = _core.rasterise_texels(layout.uv[corners], w, h)
+        places = view.to_camera(vertices[corners].reshape(-1, 3)).reshape(-1, 3, 3)
+        flat, mask = pages[page].reshape(-1, 3), filled[page].reshape(-1)
+        for first in range(0, len(texel), _TEXELS_PER_BLOCK):
+            part = slice(first, first + _TEXELS_PER_BLOCK)
+            a, b, c = np.moveaxis(places[of[part]], 1, 0)
+            j, k = weight[part, :1], weight[part, 1:]
+            uv, _ = project(view.camera, a + j * (b - a) + k * (c - a))
+            flat[texel[part]] = np.rint(sample_bilinear(smaller, (uv + 0.5) * 0.5**level - 0.5))
+            mask[texel[part]] = True
 
 
 def fill_gutters(page: Image, filled: Bool, gutter: int) -> None:

@@ -1,7 +1,7 @@
 """Texturing of moving objects: images in which the object, and nothing else, is seen (Fig. 13)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -34,19 +34,6 @@ _MAX_FACE_EDGE = 0.05  # m: longer edges are subdivided
 _MIN_TEXTURED_SHARE = 0.05  # of an object's area: less is no texture of it
 
 
-@dataclass(frozen=True, eq=False)
-class TexturedViews:
-    """The images that texture a moving object, in the object's frame.
-
-    Attributes:
-        assignment: its faces, and which of `views` textures each.
-        views: as if the object had stood still: `T_camera_map` is T_camera_object.
-    """
-
-    assignment: ViewAssignment
-    views: list[View]
-
-
 def times_in_view(box: TrackedBox, views: Sequence[View], start_ns: int) -> Float:
     """(N,) s, times of views that show the center of a box, by its clock; NaN: not."""
     seconds = np.array([1e-9 * (view.stamp_ns - start_ns) for view in views])
@@ -61,7 +48,7 @@ def times_in_view(box: TrackedBox, views: Sequence[View], start_ns: int) -> Floa
 
 def assign_object_views(
     shape: ObjectShape, background: Background, boxes: Sequence[TrackedBox], start_ns: int
-) -> TexturedViews:
+) -> tuple[ViewAssignment, list[View]]:
     """Chooses for each face of a moving object the view that shows it best.
 
     A view may texture a face if neither the background nor probably another object occludes it, and
@@ -74,6 +61,10 @@ def assign_object_views(
         background: the static surface in all views.
         boxes: of all objects, this one too.
         start_ns: stamp at which the seconds of the boxes begin.
+
+    Returns:
+        The faces, and which view textures each; the views as if the object had stood still, their
+        `T_camera_map` is T_camera_object.
     """
     mesh, _ = subdivide(shape.mesh, _MAX_FACE_EDGE)
     candidates = Candidates.empty(len(mesh), CANDIDATES)
@@ -107,7 +98,7 @@ def assign_object_views(
     areas = mesh.areas()
     if areas[assignment.view >= 0].sum() < _MIN_TEXTURED_SHARE * areas.sum():
         assignment = replace(assignment, view=np.full_like(assignment.view, NONE))
-    return TexturedViews(assignment, own)
+    return assignment, own
 
 
 def _shows_object(points: Float, depth: Float, number: int, background: Background) -> Bool:

@@ -34,6 +34,10 @@ class TrackedBox(NamedTuple):
     bottom: Float
     height: float
 
+    def motion_until(self, now: float, seconds: Float) -> Float:
+        """(n, 2) metres by which the box moves from times (n,) to a time."""
+        return self.box.center_at(np.array([now])) - self.box.center_at(seconds)
+
     @property
     def is_fast(self) -> bool:
         """True if the speed of the object exceeds that of a pedestrian."""

@@ -37,15 +37,6 @@ class Mesh(ShortRepr):
     vertices: Float
     faces: Int32
 
-    def __post_init__(self) -> None:
-        V = len(self.vertices)
-        if self.vertices.shape != (V, 3) or self.vertices.dtype != np.float64:
-            raise ValueError(f"vertices: expected (V, 3) float64, got {self.vertices.shape}")
-        if self.faces.shape != (len(self.faces), 3) or self.faces.dtype != np.int32:
-            raise ValueError(f"faces: expected (F, 3) int32, got {self.faces.shape}")
-        if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= V):
-            raise ValueError(f"faces: a vertex that is not there, of {V}")
-
     @classmethod
     def empty(cls) -> "Mesh":
         """No faces and no vertices."""
@@ -161,6 +152,12 @@ def normalize_columns(vectors: Float) -> Float:
     """(3, n) unit vectors; zero vectors stay."""
     length = np.sqrt(dot_columns(vectors, vectors))
     return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
+
+
+def planar_areas(corners: Float) -> Float:
+    """(n,) areas of triangles (n, 3, 2) in a plane."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def row_lengths(vectors: Float) -> Float:

@@ -161,7 +161,7 @@ def vertex_normals(normals: Float, faces: Int32, n: int, rounds: int) -> Float:
     """(3, n) unit normals of n points: the means of those of the triangles around.
 
     Args:
-        normals: (3, m) unit normals of the triangles.
+        normals: (3, m) normals of the triangles, whose lengths are weights.
         faces: (m, 3).
         n: number of points.
         rounds: how often they are averaged again over the triangles' corners.

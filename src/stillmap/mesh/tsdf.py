@@ -1,8 +1,7 @@
 """The static surface: TSDF integration of range images, weighted by P(static).
 
 Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images", SIGGRAPH
-1996. Tiles that no later scan reaches are extracted at once, so memory is that of the voxels around
-the sensor, and of as many triangles as are asked for.
+1996. Memory is bounded by the edge of a voxel, which is larger where much surface was seen.
 """
 
 from collections.abc import Callable, Iterable
@@ -11,16 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 import stillmap._core as _core
+from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import import_extra
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.range_image import Patch, ScanLayout, find_scan_layout, triangulate_scans
 from stillmap.mesh.triangle_mesh import (
-    Bool,
     Float,
     Float32,
     Index,
@@ -38,15 +36,13 @@ from stillmap.mesh.triangle_mesh import (
 )
 from stillmap.mesh.triangulation import range_std
 
-_TILE_RADIUS = 2.9  # tile edges from a tile's center to the farthest corner around, and some slack
 _SAMPLED_PATCHES = 8
 _MIN_VOXEL, _MAX_VOXEL = 0.02, 0.2  # m; depth cameras are no more exact than the first
 _NOISE_RATIO = 2.5  # voxel edge over the standard deviation of ranges, at least
 _MAX_SPACING = 0.75  # voxels between rows that are used
-_MAX_BYTES = 0.75e9  # of the voxels around the sensor
+_MAX_BYTES = 0.75e9  # of the voxels
 _AREA_CELL = 0.5  # m, cells by which surface area is estimated
 _SAMPLED_BEAMS = 200_000
-_SAMPLED_POSITIONS = 32  # of the sensor
 _LAYERS = 2.5  # blocks across a surface
 _BLOCK_EDGE, _BLOCK_BYTES = 8, 4200  # voxels along a block, and its size
 _MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
@@ -55,32 +51,6 @@ _SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a
 _SAMPLED_SCANS = 64  # of which the ranges are taken
 _MIN_CELL = 1e-3  # m, of the cells by which viewpoints nearby are found
 _AROUND = list(product((-1, 0, 1), repeat=3))
-
-
-class PatchExtents(NamedTuple):
-    """Bounding spheres of the patches of a recording, in their order.
-
-    Attributes:
-        position: (n, 3) metres, mean sensor position.
-        range: (n,) metres, radius.
-    """
-
-    position: Float
-    range: Float
-
-    def is_complete(self, tiles: Int64, edge: float, done: int) -> Bool:
-        """(N,) whether patches from number `done` on reach neither a tile nor its neighbors.
-
-        Args:
-            tiles: (N, 3).
-            edge: metres, of a tile.
-            done: number of patches that are integrated.
-        """
-        if done >= len(self.position):
-            return np.ones(len(tiles), np.bool_)
-        middle = (tiles + 0.5) * edge
-        away = np.asarray(cKDTree(self.position[done:]).query(middle)[0], np.float64)
-        return np.asarray(away > self.range[done:].max() + _TILE_RADIUS * edge)
 
 
 def median_range(recording: Recording) -> float:
@@ -119,33 +89,10 @@ def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
     return np.array(chosen, np.intp)
 
 
-def patch_extents(recording: Recording, poses: Float, layout: ScanLayout) -> PatchExtents:
-    """Bounding spheres of the patches that these scans become.
-
-    Args:
-        recording: 3D.
-        poses: (T, 4, 4) T_map_base.
-        layout: the patches.
-    """
-    positions, ranges = [], []
-    sensor = recording.T_map_sensor(poses)[:, :3, 3]
-    for scans in layout.groups:
-        position, far = sensor[scans].mean(axis=0), 0.0
-        for t in scans:
-            of = recording.beams_of(int(t))
-            length = np.linalg.norm(recording.points[of][recording.hit[of]], axis=1)
-            longest = float(np.max(length, initial=0.0, where=np.isfinite(length)))
-            far = max(far, longest + float(np.linalg.norm(sensor[t] - position)))
-        positions.append(position)
-        ranges.append(far)
-    return PatchExtents(np.array(positions).reshape(-1, 3), np.array(ranges))
-
-
 def choose_resolution(
     recording: Recording,
     poses: Float,
     layout: ScanLayout,
-    extents: PatchExtents,
     voxel_size: float | None = None,
 ) -> tuple[float, int]:
     """The edge of a voxel in metres, and the stride of rows and columns of range images.
@@ -157,7 +104,6 @@ def choose_resolution(
         recording: 3D, deskewed.
         poses: (T, 4, 4) T_map_base.
         layout: see `find_scan_layout`.
-        extents: of the patches.
         voxel_size: metres; None: chosen.
     """
     groups = layout.groups
@@ -173,7 +119,7 @@ def choose_resolution(
     noises = [range_std(away, one.faces) for away, one in zip(ranges, patches, strict=True)]
     noise = float(np.median(noises))
     wanted = float(np.clip(max(spacing, _NOISE_RATIO * noise), _MIN_VOXEL, _MAX_VOXEL))
-    voxel = voxel_size or max(wanted, min_voxel_size(recording, poses, extents))
+    voxel = voxel_size or max(wanted, min_voxel_size(recording, poses))
     return voxel, max(int(_MAX_SPACING * voxel / spacing), 1) if spacing > 0.0 else 1
 
 
@@ -185,37 +131,24 @@ def beam_spacing(patch: Patch) -> float:
     return float(np.median(np.sqrt(np.maximum(across, 0.0))))
 
 
-def min_voxel_size(recording: Recording, poses: Float, extents: PatchExtents) -> float:
-    """m, edge of a voxel so that those around the sensor fit into memory.
+def min_voxel_size(recording: Recording, poses: Float) -> float:
+    """m, edge of a voxel so that all of them fit into memory.
 
-    Farther voxels have been extracted by then. Surface area is estimated by the cells in which
-    beams end.
+    Surface area is estimated by the cells in which beams end.
     """
     beams = np.arange(0, recording.n_beams, max(recording.n_beams // _SAMPLED_BEAMS, 1))
-    beams = beams[recording.hit[beams]]
-    ends = recording.end_points(beams, poses)
-    cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _AREA_CELL), axis=0)
-    cells = cells * _AREA_CELL
-    n = len(extents.position)
-    sampled = np.unique(np.linspace(0, n - 1, _SAMPLED_POSITIONS).astype(np.intp))
-    most = max(
-        int(np.count_nonzero(np.linalg.norm(cells - at, axis=1) <= extents.range.max()))
-        for at in extents.position[sampled]
-    )
-    bytes_of_one = _LAYERS * _BLOCK_BYTES * most * (_AREA_CELL / _BLOCK_EDGE) ** 2
+    ends = recording.end_points(beams[recording.hit[beams]], poses)
+    ends = ends[np.isfinite(ends).all(axis=1)]
+    cells, _ = unique_cells(np.floor(ends / _AREA_CELL).astype(np.int64))
+    bytes_of_one = _LAYERS * _BLOCK_BYTES * len(cells) * (_AREA_CELL / _BLOCK_EDGE) ** 2
     return float(np.sqrt(bytes_of_one / _MAX_BYTES))
 
-
-Tile = tuple[int, ...]
 
 _MIN_P_STATIC = 0.8  # product over a triangle's beams; below, a beam has little but its prior
 TILE = 64  # voxels along a tile, whole blocks
 _MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
-_EXTRACT_BYTES = 48e6  # of new voxels after which complete tiles are extracted
 _MERGE_FACES = 250_000  # triangles that wait to be merged
 _SPARE = 2  # times the triangle budget, while the surface grows
-
-_BELOW = [way for way in product((-1, 0), repeat=3) if any(way)]
 
 
 class TsdfParameters(NamedTuple):
@@ -226,7 +159,6 @@ class TsdfParameters(NamedTuple):
         truncation_back: voxels behind it.
         min_weight: voxels need more weight than this.
         min_component_area: square metres; smaller connected components are dropped.
-        error: metres of simplification; None: from the voxel size.
         max_faces: triangle budget, whatever the error.
     """
 
@@ -234,81 +166,7 @@ class TsdfParameters(NamedTuple):
     truncation_back: float = 2.0
     min_weight: float = 0.0
     min_component_area: float = 0.05
-    error: float | None = None
     max_faces: int = 200_000
-
-
-class StreamingSurface:
-    """A surface under construction: a TSDF around the sensor, and a mesh where it is complete."""
-
-    def __init__(self, volume: _core.TsdfVolume, parameters: TsdfParameters) -> None:
-        self.volume = volume
-        self._parameters = parameters
-        error = parameters.error
-        self._error = simplification_error(volume.voxel) if error is None else error
-        self._mesh = Mesh.empty()
-        self._waiting = list[Mesh]()
-        self._extracted = set[Tile]()
-        self._held = 0.0
-
-    def is_large(self) -> bool:
-        """True if enough voxels were added since the last extraction for another one."""
-        return self.volume.memory_bytes > self._held + _EXTRACT_BYTES
-
-    def extract_complete(self, extents: PatchExtents, done: int) -> None:
-        """Extracts tiles that patches from number `done` on do not reach; frees their voxels."""
-        tiles = self._occupied_tiles()
-        edge = TILE * self.volume.voxel
-        self._extract(tiles[extents.is_complete(tiles, edge, done)])
-        self._free_voxels()
-        self._held = self.volume.memory_bytes
-
-    def finish(self, tell: Tell = no_tell) -> Mesh:
-        """The whole mesh within the budget; `tell` is called with the tiles done and the total."""
-        o = self._parameters
-        self._extract(self._occupied_tiles(), tell)
-        self._merge()
-        whole = remove_small_components(self._mesh, o.min_component_area)
-        return simplify_to_budget(simplify(whole, self._error), self._error, o.max_faces)
-
-    def _occupied_tiles(self) -> Int64:
-        """(N, 3) tiles with observed voxels, sorted."""
-        return np.unique(self.volume.blocks() // (TILE // self.volume.block_edge), axis=0)
-
-    def _extract(self, tiles: Int64, tell: Tell = no_tell) -> None:
-        for done, tile in enumerate(tiles, start=1):
-            key = tuple(tile.tolist())
-            if key not in self._extracted:
-                self._extracted.add(key)
-                part = extract_tile(self.volume, tile, self._parameters.min_weight)
-                if len(part):
-                    self._waiting.append(simplify(part, self._error))
-            if sum(map(len, self._waiting)) > max(_MERGE_FACES, len(self._mesh)):
-                self._merge()
-            tell(done, len(tiles))
-
-    def _free_voxels(self) -> None:
-        """Frees extracted tiles but those that tiles below, not yet extracted, border on."""
-        blocks = self.volume.blocks()
-        tiles = blocks // (TILE // self.volume.block_edge)
-        of_block = [tuple(tile) for tile in tiles.tolist()]
-        there = set(of_block)
-        gone = {
-            (x, y, z)
-            for x, y, z in there & self._extracted
-            if not any((x + i, y + j, z + k) in there - self._extracted for i, j, k in _BELOW)
-        }
-        self.volume.remove_blocks(blocks[[key in gone for key in of_block]])
-
-    def _merge(self) -> None:
-        """Welds waiting tiles to the mesh; its border stays, as more tiles may join it."""
-        whole = weld(concatenate_meshes([self._mesh, *self._waiting]))
-        self._waiting = []
-        if len(whole) > _MERGE_FACES:
-            whole = simplify(whole, self._error)
-            most = _SPARE * self._parameters.max_faces
-            whole = simplify_to_budget(whole, self._error, most, whole_border=True)
-        self._mesh = whole
 
 
 def build_surface(
@@ -333,8 +191,7 @@ def build_surface(
     T = recording.T_map_sensor(poses)
     chosen = select_scans(T, recording.sensor, median_range(recording))
     layout = find_scan_layout(recording, chosen)
-    extents = patch_extents(recording, poses, layout)
-    voxel, stride = choose_resolution(recording, poses, layout, extents, options.voxel_size)
+    voxel, stride = choose_resolution(recording, poses, layout, options.voxel_size)
     layout = layout._replace(stride=stride)
     n = len(layout.groups)
 
@@ -352,7 +209,7 @@ def build_surface(
         tell(n + n * done // total, 2 * n)
 
     parameters = TsdfParameters(max_faces=options.max_faces)
-    return integrate_patches(patches(), voxel, parameters, threads, tell_later, extents)
+    return integrate_patches(patches(), voxel, parameters, threads, tell_later)
 
 
 def integrate_patches(
@@ -361,7 +218,6 @@ def integrate_patches(
     parameters: TsdfParameters,
     threads: int = 1,
     tell: Tell = no_tell,
-    extents: PatchExtents | None = None,
 ) -> Mesh:
     """One surface of many patches, in the frame of their points.
 
@@ -371,21 +227,38 @@ def integrate_patches(
         parameters: see TsdfParameters.
         threads: same result with any number.
         tell: called with the tiles done and the total, after integration.
-        extents: of the patches; without them all voxels are kept to the end.
     """
     volume = _core.TsdfVolume(
         voxel,
         truncation_front=parameters.truncation_front * voxel,
         truncation_back=parameters.truncation_back * voxel,
     )
-    surface = StreamingSurface(volume, parameters)
-    for done, (patch, weight) in enumerate(patches, start=1):
+    for patch, weight in patches:
         volume.integrate(
             patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
         )
-        if extents is not None and surface.is_large():
-            surface.extract_complete(extents, done)
-    return surface.finish(tell)
+    return _extract_surface(volume, parameters, tell)
+
+
+def _extract_surface(volume: _core.TsdfVolume, parameters: TsdfParameters, tell: Tell) -> Mesh:
+    """The whole mesh within the budget, tile by tile."""
+    error = simplification_error(volume.voxel)
+    mesh, waiting = Mesh.empty(), list[Mesh]()
+    tiles, _ = unique_cells(volume.blocks() // (TILE // volume.block_edge))
+    for done, tile in enumerate(tiles, start=1):
+        part = extract_tile(volume, tile, parameters.min_weight)
+        waiting.append(simplify(part, error))
+        if done == len(tiles) or sum(map(len, waiting)) > max(_MERGE_FACES, len(mesh)):
+            mesh = weld(concatenate_meshes([mesh, *waiting]))
+            waiting = []
+            if len(mesh) > _MERGE_FACES:
+                # the border stays, as more tiles may join it
+                mesh = simplify(mesh, error)
+                most = _SPARE * parameters.max_faces
+                mesh = simplify_to_budget(mesh, error, most, whole_border=True)
+        tell(done, len(tiles))
+    mesh = remove_small_components(mesh, parameters.min_component_area)
+    return simplify_to_budget(simplify(mesh, error), error, parameters.max_faces)
 
 
 def static_weights(patch: Patch, p_static: Float32) -> Float32:

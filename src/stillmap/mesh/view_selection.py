@@ -5,8 +5,7 @@ probability and by their resolution. Neighboring faces prefer the same image (a 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from scipy.sparse.linalg import spsolve
 from stillmap.core.camera import Images, project
 from stillmap.mesh.texture import sample_bilinear
 from stillmap.mesh.triangle_mesh import Float, Float32, Image, Index, Int32, Mesh
-from stillmap.mesh.views import View
+from stillmap.mesh.views import View, read_color_image
 
 NONE = -1
 MIN_P_VISIBLE = 0.6  # probability below which an image does not texture a face
@@ -140,7 +139,7 @@ def _update_messages(
 
 
 def sample_face_colors(
-    mesh: Mesh, candidates: Candidates, views: Sequence[View], read: Callable[[View], Image | None]
+    mesh: Mesh, candidates: Candidates, views: Sequence[View], read: Callable[[View], Image]
 ) -> Float32:
     """(F, K, 3) colors of the candidates at the centers of faces, 0 to 255; NaN: unknown.
 
@@ -148,13 +147,13 @@ def sample_face_colors(
         mesh: F faces.
         candidates: K of each face.
         views: all views.
-        read: (h, w, 3) the image of a view; None: it is damaged.
+        read: (h, w, 3) the image of a view.
     """
     colors = np.full((*candidates.view.shape, 3), np.nan, np.float32)
     for number, view in enumerate(views):
         face, place = np.nonzero(candidates.view == number)
-        image = read(view) if len(face) else None
-        if image is not None:
+        if len(face):
+            image = read(view)
             uv, ok = project(view.camera, view.to_camera(mesh.centers[face]))
             colors[face[ok], place[ok]] = sample_bilinear(image, uv[ok])
     return colors
@@ -255,19 +254,11 @@ def _group_medians(of: Index, values: Float32, count: Index) -> Float:
     return np.asarray(values[order[middle]], np.float64)
 
 
-def apply_gains(images: Images, views: Sequence[View], gains: Float) -> Images:
-    """The images with those of views (n,) multiplied by gains (n, 3), clipped at 255."""
-    of = {view.image: np.asarray(one) for view, one in zip(views, gains, strict=True)}
-
-    def load(number: int) -> NDArray[Any]:
-        image = images.read(number)
-        if number not in of or image.dtype != np.uint8:
-            return image
-        tables = np.rint(np.arange(256)[:, None] * of[number]).clip(0, 255).astype(np.uint8)
-        if image.ndim == 2:
-            return np.asarray(tables[image, 0])
-        out = image.copy()
-        out[..., :3] = tables[image[..., :3], np.arange(3)]
-        return out
-
-    return replace(images, load=load)
+def read_with_gains(images: Images, views: Sequence[View], gains: Float) -> Callable[[View], Image]:
+    """Reads the images of views (n,), multiplied by gains (n, 3) and clipped at 255."""
+    levels = np.arange(256)[:, None]
+    tables = {
+        view.image: np.rint(levels * gain).clip(0, 255).astype(np.uint8)
+        for view, gain in zip(views, gains, strict=True)
+    }
+    return lambda view: tables[view.image][read_color_image(images, view), np.arange(3)]

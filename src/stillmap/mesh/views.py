@@ -13,7 +13,7 @@ from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.triangle_mesh import Bool, Float, Image, Index, Int64, Tell, no_tell
+from stillmap.mesh.triangle_mesh import Bool, Float, Image, Int64, Tell, no_tell
 from stillmap.rig.trajectory import MAX_SCAN_GAP
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 
@@ -121,12 +121,9 @@ def filter_readable(
     return kept, unread
 
 
-def read_color_image(images: Images, view: View) -> Image | None:
-    """(height, width, 3) the image of a view; None where it is damaged or missing."""
-    try:
-        return as_color_image(images.read(view.image), view)
-    except InputError:
-        return None
+def read_color_image(images: Images, view: View) -> Image:
+    """(height, width, 3) the image of a view, see `as_color_image`."""
+    return as_color_image(images.read(view.image), view)
 
 
 def as_color_image(image: NDArray[Any], view: View) -> Image:
@@ -157,53 +154,31 @@ def interpolate_poses(stamp_ns: Int64, poses: Float, wanted_ns: Int64) -> tuple[
     Returns:
         (n, 4, 4) poses; and for each the reason why it is unknown, "" if it is known.
     """
-    n = len(wanted_ns)
     if not len(stamp_ns):
+        n = len(wanted_ns)
         return np.tile(np.eye(4), (n, 1, 1)), [_OUTSIDE] * n
-    # of scans with one stamp (two lasers) the last before, the first after
-    right = np.searchsorted(stamp_ns, wanted_ns, side="left")
-    left = np.searchsorted(stamp_ns, wanted_ns, side="right") - 1
-    inside = (left >= 0) & (right < len(stamp_ns))
-    away_ns = _nearest_scan_ns(stamp_ns, wanted_ns)
-    near = away_ns <= round(_MAX_IMAGE_EXTRAPOLATION * 1e9)
-    left, right = _bracketing_scans(stamp_ns, left, right)
+    stamp_ns, first = np.unique(stamp_ns, return_index=True)  # two lasers may share stamps
+    poses, last = poses[first], len(stamp_ns) - 1
+    left = np.clip(np.searchsorted(stamp_ns, wanted_ns, side="right") - 1, 0, max(last - 1, 0))
+    right = np.minimum(left + 1, last)
     seconds = 1e-9 * (stamp_ns[right] - stamp_ns[left])
+    since = 1e-9 * (wanted_ns - stamp_ns[left])
+    away = np.minimum(np.abs(since), np.abs(since - seconds))
+    outside, near = (since < 0.0) | (since > seconds), away <= _MAX_IMAGE_EXTRAPOLATION
     twist = se3.log(se2.inverse(poses[left]) @ poses[right])
     moved, turned = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
     gap = seconds > MAX_SCAN_GAP
     stationary = (moved <= _STATIONARY[0]) & (turned <= _STATIONARY[1])
     jump = (moved > MAX_SPEED * seconds) | (turned > MAX_TURN_RATE * seconds)
-    share = np.divide(
-        1e-9 * (wanted_ns - stamp_ns[left]), seconds, out=np.zeros(n), where=seconds > 0.0
-    )
+    share = np.divide(since, seconds, out=np.zeros(len(since)), where=seconds > 0.0)
     # motion over a gap is not extrapolated
-    share = np.where(~inside & gap, np.round(np.clip(share, 0.0, 1.0)), share)
+    share = np.where(outside & gap, np.round(np.clip(share, 0.0, 1.0)), share)
     T = poses[left] @ se3.exp(share[:, None] * twist)
-    reasons = np.full(n, "", object)
-    reasons[jump & (away_ns > 0)] = _AT_JUMP
-    reasons[inside & gap & ~stationary & ~near] = _IN_GAP
-    reasons[~inside & ~near] = _OUTSIDE
+    reasons = np.full(len(since), "", object)
+    reasons[jump & (away > 0.0)] = _AT_JUMP
+    reasons[~outside & gap & ~stationary & ~near] = _IN_GAP
+    reasons[outside & ~near] = _OUTSIDE
     return T, reasons.tolist()
-
-
-def _nearest_scan_ns(stamp_ns: Int64, wanted_ns: Int64) -> Int64:
-    """(n,) nanoseconds to the nearest scan."""
-    right = np.minimum(np.searchsorted(stamp_ns, wanted_ns), len(stamp_ns) - 1)
-    left = np.maximum(right - 1, 0)
-    ways = np.abs(wanted_ns - stamp_ns[left]), np.abs(wanted_ns - stamp_ns[right])
-    return np.asarray(np.minimum(*ways))
-
-
-def _bracketing_scans(stamp_ns: Int64, left: Index, right: Index) -> tuple[Index, Index]:
-    """(n,), (n,) the scans between which poses are interpolated; at the ends the outermost two."""
-    last = len(stamp_ns) - 1
-    # the first scan of the last two stamps, the last of the first two
-    before_last = max(int(np.searchsorted(stamp_ns, stamp_ns[-1])) - 1, 0)
-    second = min(int(np.searchsorted(stamp_ns, stamp_ns[0], side="right")), last)
-    early, late = left < 0, right > last
-    left = np.where(early, second - 1 if second else 0, np.where(late, before_last, left))
-    right = np.where(early, second, np.where(late, last, right))
-    return left, right
 
 
 def _check_camera(images: Images, number: int) -> tuple[Camera | None, str]:

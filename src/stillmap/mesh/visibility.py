@@ -16,15 +16,15 @@ from stillmap.mesh.triangle_mesh import (
     Index,
     Int32,
     Mesh,
-    cross_columns,
     dot_columns,
-    normalize_columns,
+    planar_areas,
+    row_lengths,
 )
 from stillmap.mesh.views import View
 
 DEPTH_SCALE = 0.5  # pixels of the z-buffer per pixel of the image
 NEAR = 0.05  # m ahead of a camera: nothing nearer is visible
-IMAGE_MARGIN = 2.0  # pixels inside the image's border
+_IMAGE_MARGIN = 2.0  # pixels inside the image's border
 _MIN_COSINE = 0.03  # of the angle between normal and line of sight
 _MIN_AREA = 0.25  # square pixels of a face
 _DEPTH_TOLERANCE = 0.01  # m by which a face may lie behind the z-buffer
@@ -78,21 +78,20 @@ def find_visible_faces(mesh: Mesh, view: View) -> Float32:
         view: with a calibration that `calibration_error` accepts.
     """
     points = view.to_camera(mesh.vertices)
-    uv, inside = _project_inside(view, points)
+    uv, inside = project_inside(view, points)
     a, b, c = mesh.faces.T
     faces = np.flatnonzero(inside[a] & inside[b] & inside[c])
-    columns = np.ascontiguousarray(points.T)
-    # (3, 3, n) by corner and coordinate: long rows are fast
-    corners = np.stack([columns[:, mesh.faces[faces, k]] for k in range(3)])
-    pixels = _pixel_areas(uv, mesh.faces[faces])
-    kept = (_view_cosines(corners) > _MIN_COSINE) & (pixels >= _MIN_AREA)
-    faces, pixels, corners = faces[kept], pixels[kept], corners[..., kept]
+    local = Mesh(points, mesh.faces[faces])
+    pixels, normals, centers = planar_areas(uv[local.faces]), local.normals(), local.centers
+    cosine = -np.einsum("ni,ni->n", normals, centers) / row_lengths(centers)
+    kept = (cosine > _MIN_COSINE) & (pixels >= _MIN_AREA)
+    faces, pixels, normals = faces[kept], pixels[kept], normals[kept]
     out = np.zeros(len(mesh), np.float32)
     if len(faces):
         used = np.zeros(len(points), np.bool_)
         used[mesh.faces[faces]] = True
         buffer = render_depth(mesh, view, points[used], DEPTH_SCALE)
-        free = _is_unoccluded(buffer, corners)
+        free = _is_unoccluded(buffer, points[mesh.faces[faces]], normals)
         out[faces[free]] = pixels[free]
     return out
 
@@ -117,31 +116,16 @@ def render_depth(mesh: Mesh, view: View, shown: Float, scale: float) -> DepthBuf
     high = np.ceil(np.minimum(at.max(axis=0), middle + most)) + 2.0
     K[:2, 2] -= low
     width, height = (int(size) for size in np.maximum(high - low + 1.0, 1.0))
-    near_by = _faces_in_frustum(mesh, view, K, width, height)
     depth, face = _core.render_z_buffer(
         np.ascontiguousarray(mesh.vertices),
-        np.ascontiguousarray(mesh.faces[near_by]),
+        np.ascontiguousarray(mesh.faces),
         K,
         np.ascontiguousarray(view.T_camera_map, np.float64),
         width,
         height,
         near=NEAR,
     )
-    number = np.append(near_by, -1).astype(np.int32)
-    return DepthBuffer(K, depth, number[face])
-
-
-def _faces_in_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -> Index:
-    """Faces that are not beyond one border of an image, or behind it, with all their corners."""
-    x, y, z = np.ascontiguousarray(view.to_camera(mesh.vertices).T)
-    u, v = K[0, 0] * x + K[0, 1] * y + K[0, 2] * z, K[1, 1] * y + K[1, 2] * z
-    # a pixel more: the kernel rounds otherwise at borders
-    sides = (u < -z, v < -z, u > width * z, v > height * z, z < 0.0)
-    beyond = np.zeros(len(z), np.uint8)
-    for bit, side in enumerate(sides):
-        beyond |= side.astype(np.uint8) << np.uint8(bit)
-    a, b, c = mesh.faces.T
-    return np.flatnonzero((beyond[a] & beyond[b] & beyond[c]) == 0)
+    return DepthBuffer(K, depth, face)
 
 
 def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
@@ -150,44 +134,23 @@ def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
-def _project_inside(view: View, points: Float) -> tuple[Float, Bool]:
+def project_inside(view: View, points: Float) -> tuple[Float, Bool]:
     """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the image."""
     uv, ok = project(view.camera, points)
     size = np.array([view.camera.width, view.camera.height])
     with np.errstate(invalid="ignore"):  # NaN: not in the image
-        ok &= ((uv >= IMAGE_MARGIN) & (uv <= size - 1.0 - IMAGE_MARGIN)).all(axis=1)
+        ok &= ((uv >= _IMAGE_MARGIN) & (uv <= size - 1.0 - _IMAGE_MARGIN)).all(axis=1)
     return uv, ok
 
 
-def _view_cosines(corners: Float) -> Float32:
-    """(n,) of the angle between normals and lines of sight, for corners (3, 3, n)."""
-    normal, center = _face_normals(corners), corners.sum(axis=0) / 3.0
-    dot, length = -dot_columns(center, normal), np.sqrt(dot_columns(center, center))
-    return np.asarray(dot / np.where(length > 0.0, length, 1.0), np.float32)
-
-
-def _face_normals(corners: Float) -> Float:
-    """(3, n) unit vectors, zero for faces without area."""
-    return normalize_columns(cross_columns(corners[1] - corners[0], corners[2] - corners[0]))
-
-
-def _pixel_areas(uv: Float, faces: Int32) -> Float32:
-    """(n,) square pixels of triangles (n, 3) over pixels (V, 2)."""
-    u, v = (np.ascontiguousarray(column) for column in uv.T)
-    a, b, c = faces.T
-    au, av, bu, bv = u[b] - u[a], v[b] - v[a], u[c] - u[a], v[c] - v[a]
-    return np.asarray(0.5 * np.abs(au * bv - av * bu), np.float32)
-
-
-def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Bool:
-    """(n,) whether nothing lies in front of triangles (3, 3, n) in the camera's frame."""
-    free = np.ones(corners.shape[2], np.bool_)
-    normal = _face_normals(corners)
+def _is_unoccluded(buffer: DepthBuffer, corners: Float, normals: Float) -> Bool:
+    """(n,) whether nothing lies in front of triangles (n, 3, 3) in the camera's frame."""
+    free = np.ones(len(corners), np.bool_)
     # (h, w) minimum depth within some pixels along rows and columns
     around = ndimage.minimum_filter(buffer.depth, 2 * _DILATION + 1, mode="nearest")
     for weight in _SAMPLES:
-        point = np.einsum("k,kin->in", weight, corners[..., free])
-        free[free] = _passes_depth_test(buffer, around, point, normal[:, free])
+        points = np.einsum("k,nki->in", weight, corners[free])
+        free[free] = _passes_depth_test(buffer, around, points, normals[free].T)
     return free
 
 

@@ -106,9 +106,8 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
     for one in models.objects:
         name = f"{one.shape.id:04d}"
         write_glb(objects / f"{name}.glb", _drop_empty_texture(one.textured), quality)
-        found = one.face_views
         path = objects / f"{name}_faces.npz"
-        write_faces(path, found.assignment, found.views, n_images, "object")
+        write_faces(path, one.assignment, one.views, n_images, "object")
         record = {
             "stamp_ns": one.stamp_ns,
             "first_stamp_ns": one.span_ns[0],
@@ -176,7 +175,7 @@ def models_record(models: Models) -> dict[str, Any]:
             "used": len(used),
             "usable": len(models.views),
             "left_out": dict(models.left_out),
-            "unread": [*models.unread, *models.textured.unread],
+            "unread": list(models.unread),
         },
         "pages": [list(page.shape[:2]) for page in models.textured.pages],
         "objects": {"found": models.n_objects, "modelled": len(models.objects)},

@@ -9,7 +9,7 @@ from recordings import of_one_sensor
 from stillmap.core.camera import Camera, Images
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import Background, ViewAssignment
-from stillmap.mesh.point_colors import TrackedReturns, color_moving
+from stillmap.mesh.point_colors import color_moving
 from stillmap.mesh.segmentation import DynamicReturns
 from stillmap.mesh.texture import GRAY
 from stillmap.mesh.tracked_boxes import TrackedBox
@@ -35,7 +35,7 @@ def thing(number: int, x: float, y: float, half: tuple[float, float], speed: flo
     return TrackedBox(box, np.zeros(2), 2.0)
 
 
-def board_seen(*others: TrackedBox) -> TrackedReturns:
+def board_seen(*others: TrackedBox) -> DynamicReturns:
     n = len(BOARD)
     ends = [
         np.column_stack([BOARD[:, 0] + SPEED * t, np.full(n, AHEAD), BOARD[:, 1]]) for t in TIMES
@@ -55,7 +55,7 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
         boxes=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
         start_ns=0,
     )
-    return TrackedReturns.collect(DynamicReturns.collect(sources))
+    return DynamicReturns.collect(sources).tracked()
 
 
 def view(number: int, seconds: float) -> View:

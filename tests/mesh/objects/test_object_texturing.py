@@ -76,22 +76,22 @@ def dress(views, place=None, colours=None, others=(), of=None):
 
 
 def area_painted(found):
-    areas = found.assignment.mesh.areas()
-    return areas[found.assignment.view >= 0].sum()
+    areas = found[0].mesh.areas()
+    return areas[found[0].view >= 0].sum()
 
 
 def painted_at(found):
     """x and z of what is painted."""
-    return found.assignment.mesh.centers[found.assignment.view >= 0][:, [0, 2]]
+    return found[0].mesh.centers[found[0].view >= 0][:, [0, 2]]
 
 
 def test_a_thing_is_painted_by_what_shows_it():
     found = dress([view(0, 0.0), view(1, 30.0)])
     assert area_painted(found) == pytest.approx(0.5)
-    assert [one.image for one in found.views] == [0]
+    assert [one.image for one in found[1]] == [0]
     # as if it had stood still
     np.testing.assert_allclose(
-        found.views[0].to_camera(np.zeros((1, 3))), [[0.0, 0.5, 2.0]], atol=1e-9
+        found[1][0].to_camera(np.zeros((1, 3))), [[0.0, 0.5, 2.0]], atol=1e-9
     )
 
 

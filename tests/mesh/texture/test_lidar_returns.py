@@ -101,7 +101,7 @@ def _row(p: list[float], planar: bool) -> LidarReturns:
     poses, of_all = np.tile(np.eye(4), (4, 1, 1)), np.ones(12, np.float32)
     of_all[::3] = p
     out = _returns(_recording(None), poses, of_all, box, np.array([0, 3, 6, 9]))
-    out.is_planar = planar
+    out.inputs.__dict__["is_planar"] = planar
     return out
 
 

@@ -7,7 +7,6 @@ from made_up_rooms import K, box, camera, looking, rectangle
 
 from stillmap import _core
 from stillmap.core import camera as camera_module
-from stillmap.mesh import visibility
 from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 from stillmap.mesh.visibility import find_visible_faces, scale_intrinsics
 
@@ -86,11 +85,3 @@ def test_the_lens_decides_what_is_in_the_picture():
     assert (seen > 0).sum() > 1.1 * (plain > 0).sum()  # it shows more, and it smaller
     corner = np.argmin(np.where(plain > 0, uv[WALL.faces].sum(axis=(1, 2)), np.inf))
     assert seen[corner] < 0.9 * plain[corner]
-
-
-def test_the_margin(monkeypatch):
-    near = find_visible_faces(WALL, AHEAD) > 0
-    monkeypatch.setattr(visibility, "IMAGE_MARGIN", 60.0)
-    far = find_visible_faces(WALL, AHEAD) > 0
-    assert 0 < far.sum() < near.sum()
-    assert near[far].all()

@@ -8,7 +8,6 @@
 #include <cmath>
 #include <cstdint>
 #include <stdexcept>
-#include <unordered_set>
 #include <vector>
 
 #include "stillmap/grid/block_layout.hpp"
@@ -48,17 +47,6 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
   double voxel() const { return voxel_; }
   double truncation_front() const { return truncation_front_; }
   double truncation_back() const { return truncation_back_; }
-
-  size_t memory_bytes() const { return blocks().size() * (sizeof(Block) + 64); }
-
-  // Removes blocks and frees their memory.
-  void remove_blocks(const std::vector<Cell<3>>& blocks) {
-    std::unordered_set<uint64_t, BlockLayout<3>::Hash> removed;
-    for (const Cell<3>& block : blocks) removed.insert(BlockLayout<3>::key(block));
-    keep_if([&](const Cell<3>& block) {
-      return removed.find(BlockLayout<3>::key(block)) == removed.end();
-    });
-  }
 
   // Works in batches to bound the memory of pending terms.
   void integrate(const TriangleBatch& triangles, int threads) {
