@@ -52,7 +52,7 @@ def test_texels_are_pixels(room, monkeypatch):
     np.testing.assert_allclose(apart, np.rint(apart), atol=1e-6)
     # the faces of a chart are moved alike
     chart = charts_of(layout)[painted]
-    assert len(np.unique(chart)) > 8
+    assert len(np.unique(chart)) >= 8
     for number in np.unique(chart):
         assert np.ptp(np.rint(apart[chart == number]), axis=(0, 1)).max() == 0
 
