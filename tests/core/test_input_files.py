@@ -17,7 +17,6 @@ from stillmap.core.input_files import (
     InputPath,
     ShorterFileError,
     copy_content,
-    open_lock,
     read_bytes,
     read_text,
 )
@@ -130,16 +129,6 @@ def test_arrays_that_cannot_be(tmp_path):
     os.truncate(tmp_path / "a.npy", 500)
     with pytest.raises(InputError, match=r"is damaged: no \(100,\) int64 follow its header"):
         open_npy(tmp_path / "a.npy")
-
-
-def test_lock_is_a_file(tmp_path):
-    with open_lock(tmp_path / "lock"), open_lock(tmp_path / "lock"):
-        pass
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "link").symlink_to("pipe")
-    for name in ("pipe", "link"):
-        with pytest.raises(InputError, match="no regular file"):
-            open_lock(tmp_path / name)
 
 
 def test_recording_that_shrinks_while_it_is_mapped(tmp_path):

@@ -11,7 +11,7 @@ import os
 import shutil
 import stat
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from stillmap.core.errors import InputError
 
@@ -151,23 +151,3 @@ def copy_file(source: str | os.PathLike[str], target: str | os.PathLike[str]) ->
     """Copy a file with its permissions and dates; see `copy_content`."""
     copy_content(source, target)
     shutil.copystat(source, target)
-
-
-def open_lock(path: Path) -> IO[bytes]:
-    """Open a lock file, which is made where it is missing.
-
-    Raises:
-        InputError: something else is there: to open a pipe waits for its reader.
-        OSError: it cannot be opened, or it is a link.
-    """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
-    try:
-        handle = os.open(path, flags, 0o666)
-    except OSError as error:
-        if path.exists() and not path.is_file():
-            raise _irregular_error(path) from error
-        raise
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
-        os.close(handle)
-        raise _irregular_error(path)
-    return os.fdopen(handle, "ab")

@@ -54,22 +54,31 @@ def write_kitti(job: FilterJob) -> Omissions:
 def write_pcd(job: FilterJob) -> Omissions:
     """Copy a file or folder; points of organised clouds become NaN, others are removed."""
 
-    def filter_file(path: Path, new: Path, mask: Mask) -> None:
-        layout = pcd.read_header(path).layout
-        _copy_table(layout, new, mask, _counts(layout, mask, {b"WIDTH": 1, b"POINTS": 1}))
+    def read_layout(path: Path) -> TableLayout:
+        return pcd.read_header(path).layout
 
-    return _write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
+    return _write_tables(job, pcd.EXTENSIONS, read_layout, {b"WIDTH": 1, b"POINTS": 1})
 
 
 def write_ply(job: FilterJob) -> Omissions:
     """Copy a file or folder; vertices are removed, or become NaN where other elements, such as
     faces, may refer to them by their number."""
+    return _write_tables(job, ply.EXTENSIONS, ply.read_layout, {b"element vertex": 2})
+
+
+def _write_tables(
+    job: FilterJob,
+    extensions: tuple[str, ...],
+    read_layout: Callable[[Path], TableLayout],
+    counts: dict[bytes, int],
+) -> Omissions:
+    """Copy a file or folder of tables; `counts`: see `_edit_counts`."""
 
     def filter_file(path: Path, new: Path, mask: Mask) -> None:
-        layout = ply.read_layout(path)
-        _copy_table(layout, new, mask, _counts(layout, mask, {b"element vertex": 2}))
+        layout = read_layout(path)
+        _copy_table(layout, new, mask, _edit_counts(layout, mask, counts))
 
-    return _write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
+    return _write_files(job, files_of(job.source, extensions), filter_file)
 
 
 def write_las(job: FilterJob) -> Omissions:
@@ -166,7 +175,7 @@ def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:
 EditLine = Callable[[bytes], bytes]
 
 
-def _counts(layout: TableLayout, mask: Mask, words: dict[bytes, int]) -> EditLine:
+def _edit_counts(layout: TableLayout, mask: Mask, words: dict[bytes, int]) -> EditLine:
     """Sets the count of points in lines of a header that begin so, at the word of this index."""
     count = len(mask) - int(np.count_nonzero(mask))
 

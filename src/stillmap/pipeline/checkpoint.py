@@ -26,7 +26,7 @@ from stillmap.core.arrays import iter_bytes
 from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import hidden_path, package_version, remove, resolve_output
-from stillmap.core.input_files import open_lock
+from stillmap.core.input_files import require_regular
 from stillmap.core.interrupts import defer_signals
 from stillmap.core.json import to_jsonable
 from stillmap.core.profiling import StageTimer
@@ -153,7 +153,9 @@ def _lock(folder: Path, output: Path) -> IO[bytes]:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # the run that had it has just ended
-            file = open_lock(folder / _LOCK)
+            if (folder / _LOCK).exists():
+                require_regular(folder / _LOCK)  # to open a pipe would wait for its reader
+            file = (folder / _LOCK).open("ab")
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
