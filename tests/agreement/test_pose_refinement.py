@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 from reference import pose_refinement
+from rooms import ROOM, drive
 
 from stillmap import _core
 from stillmap.core import se2
-from stillmap.sim import RobotOptions, Scene, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions
-from stillmap.sim.walls import box
 from stillmap.slam import scan_hits, scan_matching
 
 OWN_POSE_STD = np.array([0.02, 0.02])
@@ -17,15 +15,8 @@ OWN_POSE_STD = np.array([0.02, 0.02])
 @pytest.fixture(scope="module")
 def watched():
     """A recording of a room with a person, disturbed poses, and labels."""
-    scene = Scene(
-        "room",
-        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
-        route=((-3.0, -2.0), (3.0, -2.0), (3.0, 0.5)),
-        laser=LaserOptions(beams=90, max_range=6.0),
-        crowd=CrowdOptions(people=1),
-        robot=RobotOptions(scans=30),
-    )
-    found = simulate(scene, 3)
+    route, laser = ((-3.0, -2.0), (3.0, -2.0), (3.0, 0.5)), {"beams": 90, "max_range": 6.0}
+    found = drive(3, ROOM, route, 1, laser=laser, robot={"scans": 30})
     rng = np.random.default_rng(0)
     shift = se2.matrix(*(0.02 * rng.standard_normal((3, 30))))
     e = rng.choice([0.0, 0.3, 1.0], found.recording.n_beams, p=[0.1, 0.2, 0.7])

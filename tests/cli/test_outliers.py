@@ -106,7 +106,7 @@ def test_one_far_pose(map_it, room, poses, far):
     assert (out / "report.html").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("leap", [1e4, 1e6])
+@pytest.mark.parametrize("leap", [1e4, pytest.param(1e6, marks=pytest.mark.slow)])
 def test_odometry_that_leaps(map_it, changed, leap):
     def change(T):
         T[20:, :2, 2] += leap

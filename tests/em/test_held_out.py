@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from recordings import of_one_sensor
+from rooms import drive
 
 from stillmap import em
 from stillmap.core import chunks, se2
 from stillmap.em.quality import select_held_out_scans
-from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
 
 RESOLUTION, EVERY = 0.05, 10
@@ -17,15 +17,9 @@ RESOLUTION, EVERY = 0.05, 10
 
 @pytest.fixture(scope="module")
 def room():
-    scene = Scene(
-        "room",
-        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
-        crowd=CrowdOptions(people=6),
-        laser=LaserOptions(beams=180, range_noise=0.01, max_range=8.0),
-        robot=RobotOptions(scans=120),
-    )
-    sim = simulate(scene, np.random.default_rng(4))
+    walls = *box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6)
+    laser = {"beams": 180, "range_noise": 0.01, "max_range": 8.0}
+    sim = drive(np.random.default_rng(4), walls, people=6, laser=laser, robot={"scans": 120})
     assert (sim.truth.mover >= 0).sum() > 500
     return sim
 

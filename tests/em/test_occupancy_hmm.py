@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
+from rooms import ROOM, ROUTE, drive
 
 from stillmap import _core, em
 from stillmap.core import chunks
 from stillmap.em import occupancy_hmm
 from stillmap.results.eval.labels import assign_equal_width_bins, compute_calibration_error
-from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
-from stillmap.sim.walls import box
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
 BALL = len(WALLS)  # the number of the first ball
@@ -201,15 +200,9 @@ def test_one_hit():
 @pytest.fixture(scope="module")
 def crowd():
     """Three minutes in a room with four people, at poses that are known."""
-    scene = Scene(
-        "room",
-        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5), (-2.5, -1.5)),
-        crowd=CrowdOptions(people=4),
-        laser=LaserOptions(beams=180, range_noise=0.01, max_range=12.0),
-        robot=RobotOptions(scans=500),
-    )
-    return simulate(scene, np.random.default_rng(7))
+    laser = {"beams": 180, "range_noise": 0.01, "max_range": 12.0}
+    route = (*ROUTE, ROUTE[0])
+    return drive(np.random.default_rng(7), ROOM, route, 4, laser=laser, robot={"scans": 500})
 
 
 def test_labels_are_calibrated(crowd):

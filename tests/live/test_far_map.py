@@ -40,7 +40,9 @@ def drive(recording, place, mode="localise"):
 
 # m: rounding moves single scans, as their cost has steps where end points leave observed space
 # and in a map that grows the scans after them
-@pytest.mark.parametrize(("mode", "rounding"), [("localise", 2e-3), ("extend", 4e-3)])
+@pytest.mark.parametrize(
+    ("mode", "rounding"), [("localise", 2e-3), pytest.param("extend", 4e-3, marks=pytest.mark.slow)]
+)
 def test_what_is_told_is_in_the_frame_of_the_map(hall, tmp_path, mode, rounding):
     recording, folder = hall
     near, told = drive(recording, folder / "near", mode)

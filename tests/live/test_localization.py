@@ -19,9 +19,10 @@ class Place:
 
     def __init__(self, world, seed, folder):
         simulation = simulate(scene_by_name(world, {"crowd": {"people": 0}}), seed)
-        stillmap.build(simulation.recording, {"threads": 1, "em.max_iterations": 1}).save(folder)
         self.folder, self._world = folder, world
         self._T_map_world = se2.inverse(simulation.truth.T_world_base[0])
+        poses = self._T_map_world @ simulation.truth.T_world_base
+        stillmap.build(simulation.recording, {"threads": 1}, poses=poses).save(folder)
 
     def simulate(self, seed, **changes):
         return simulate(scene_by_name(self._world, changes), seed)

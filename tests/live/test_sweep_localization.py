@@ -34,9 +34,11 @@ def place(tmp_path_factory):
     """The result of a run through the hall, and T_map_world."""
     simulation = run_through_hall(1, 4, 130)
     folder = tmp_path_factory.mktemp("place") / "hall"
-    changes = {"threads": 1, "em.max_iterations": 1, "objects.enabled": False}
-    stillmap.build(simulation.recording, changes).save(folder)
-    return folder, se2.inverse(simulation.truth.T_world_base[0])
+    changes = {"threads": 1, "objects.enabled": False}
+    T_map_world = se2.inverse(simulation.truth.T_world_base[0])
+    poses = T_map_world @ simulation.truth.T_world_base
+    stillmap.build(simulation.recording, changes, poses=poses).save(folder)
+    return folder, T_map_world
 
 
 @pytest.fixture(scope="module")

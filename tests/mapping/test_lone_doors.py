@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 import pytest
+from rooms import drive
 
 import stillmap
 from stillmap.core.config import override
 from stillmap.mapping.doors import Door, DoorState
 from stillmap.mapping.lone_doors import compute_p_moved
 from stillmap.pipeline.options import Options
-from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
 
 S = 10**9
@@ -84,15 +84,11 @@ def shut(sim, since):
 
 def world(leaf):
     partition = ((-4.0, 0.0, 0.5, 0.0), (0.5, 0.0, *HINGE), (1.5, 0.0, 1.5, 0.15), (1.5, 0, 5.0, 0))
-    scene = Scene(
-        "corridor",
-        walls=(*box(0.5, 0.5, 9, 5), *partition, *leaf),
-        route=((-2.0, -0.9), (1.0, -0.9), (1.0, 2.0), (-2.0, 2.0)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(beams=361, range_noise=0.01, fov=2 * np.pi),
-        robot=RobotOptions(scans=120, scan_rate=4.0, speed=0.5),
-    )
-    return simulate(scene, np.random.default_rng(3))
+    walls = *box(0.5, 0.5, 9, 5), *partition, *leaf
+    route = ((-2.0, -0.9), (1.0, -0.9), (1.0, 2.0), (-2.0, 2.0))
+    laser = {"beams": 361, "range_noise": 0.01, "fov": 2 * np.pi}
+    robot = {"scans": 120, "scan_rate": 4.0, "speed": 0.5}
+    return drive(np.random.default_rng(3), walls, route, laser=laser, robot=robot)
 
 
 def shown(result, cells):

@@ -1,26 +1,16 @@
 """Simulated drives as contexts of loop closure."""
 
 import numpy as np
+from rooms import drive
 
 from stillmap.core import se2
-from stillmap.sim import RobotOptions, Scene, simulate
-from stillmap.sim.options import CrowdOptions, OdometryOptions
 from stillmap.slam import local_map
 from stillmap.slam.types import LoopContext
 
 
 def driven(walls, route, laser, speed=1.0):
     """A recording of a robot that drives among walls, with true poses."""
-    scene = Scene(
-        "across",
-        walls=walls,
-        route=route,
-        crowd=CrowdOptions(people=0),
-        laser=laser,
-        robot=RobotOptions(speed=speed),
-        odometry=OdometryOptions(),
-    )
-    simulation = simulate(scene, 0)
+    simulation = drive(0, walls, route, laser=laser, robot={"speed": speed})
     truth = simulation.truth.T_world_base
     poses = se2.inverse(truth[0]) @ truth
     return LoopContext(

@@ -5,12 +5,12 @@ import functools
 
 import numpy as np
 import pytest
+from rooms import drive
 
 from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.results.eval.trajectory import compute_absolute_errors
-from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.sim import scene_by_name, simulate
 from stillmap.sim.walls import box
 from stillmap.slam import (
     SlamOptions,
@@ -24,6 +24,7 @@ from stillmap.slam.types import LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()
 OPEN = SlamOptions(loop_closure=False)
+LASER = {"beams": 120, "max_range": 6.0}
 
 
 def silent(*_):
@@ -49,32 +50,18 @@ def square():
         for at in ((x, -6.9), (6.9, x), (x + 1, 6.9), (-6.9, x))
         for wall in box(*at, 0.2 + 0.03 * x, 0.3)
     ]
-    scene = Scene(
-        "square",
-        walls=(*box(0, 0, 14, 14), *box(0, 0, 10, 10), *pillars),
-        route=((-3, -6), (6, -6), (6, 6), (-6, 6), (-6, -6), (3, -6)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(beams=120, max_range=6.0),
-        robot=RobotOptions(),
-        odometry=OdometryOptions(drift_noise=0.02),
-    )
-    return simulate(scene, 1)
+    walls = *box(0, 0, 14, 14), *box(0, 0, 10, 10), *pillars
+    route = ((-3, -6), (6, -6), (6, 6), (-6, 6), (-6, -6), (3, -6))
+    return drive(1, walls, route, laser=LASER, odometry={"drift_noise": 0.02})
 
 
 @functools.cache
 def repetitive():
     """A corridor with a niche every two metres; forth, back and forth again."""
     niches = [wall for x in range(0, 40, 2) for wall in box(x, 1.15, 0.5, 0.3)]
-    scene = Scene(
-        "repetitive",
-        walls=(*box(19, 0, 44, 2.6), *niches),
-        route=((-1, -0.2), (30, -0.2), (1, -0.3), (20, -0.2)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(beams=120, max_range=6.0),
-        robot=RobotOptions(),
-        odometry=OdometryOptions(drift_noise=0.01),
-    )
-    return simulate(scene, 2)
+    route = ((-1, -0.2), (30, -0.2), (1, -0.3), (20, -0.2))
+    walls = *box(19, 0, 44, 2.6), *niches
+    return drive(2, walls, route, laser=LASER, odometry={"drift_noise": 0.01})
 
 
 def errors(found, simulation):

@@ -8,7 +8,6 @@ from driven import driven
 
 from stillmap import _core
 from stillmap.core import se2
-from stillmap.sim.options import LaserOptions
 from stillmap.sim.walls import box
 from stillmap.slam import loop_candidates, loop_verification
 from stillmap.slam.loop_verification import (
@@ -26,7 +25,7 @@ def divided(width):
     """A room with a wall of 0.2 m across it, and a robot that drives around that."""
     walls = (*box(0, 0, 24, 14), *box(0, 0, width, 0.2))
     route = ((-8, -3.5), (9.5, -3.5), (9.5, 3.5), (-8, 3.5))
-    return driven(walls, route, LaserOptions(beams=180, max_range=30.0))
+    return driven(walls, route, {"beams": 180, "max_range": 30.0})
 
 
 def over_the_wall(context):
@@ -76,7 +75,7 @@ def street():
         for wall in box(x + 4.0, y + sign * (3.0 + rng.uniform(-2.0, 2.0)), 6.0, 6.0)
     ]
     route = ((2.0, -5.0), (78.0, -5.0), (78.0, 5.0), (2.0, 5.0))
-    return driven(tuple(fronts), route, LaserOptions(beams=361, max_range=80.0), speed=5.0)
+    return driven(tuple(fronts), route, {"beams": 361, "max_range": 80.0}, speed=5.0)
 
 
 def test_loops_close_across_a_street():

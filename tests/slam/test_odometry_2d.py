@@ -5,17 +5,17 @@ import functools
 
 import numpy as np
 import pytest
+from rooms import drive
 
 from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.results.eval.trajectory import compute_absolute_errors
-from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.sim.walls import box
+from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import SlamOptions, m_step, odometry_2d
 
 OPTIONS = SlamOptions()
+ALL_ROUND = {"beams": 240, "fov": 2 * np.pi, "range_noise": 0.005, "max_range": 8.0}
 
 
 def silent(*_):
@@ -37,17 +37,9 @@ def run_through(scene, scans=200, seed=3):
     return simulate(scene_by_name(scene, {"robot": {"scans": scans}}), seed)
 
 
-def small_room(laser=None, scans=60, people=0, seed=2):
-    scene = Scene(
-        "room",
-        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
-        crowd=CrowdOptions(people=people),
-        laser=laser or LaserOptions(range_noise=0.01, max_range=8.0),
-        robot=RobotOptions(scans=scans),
-        odometry=OdometryOptions(),
-    )
-    return simulate(scene, seed)
+def small_room(laser=None, scans=60, people=0):
+    laser = laser or {"range_noise": 0.01, "max_range": 8.0}
+    return drive(2, people=people, laser=laser, robot={"scans": scans})
 
 
 def ate(mapped, simulation):
@@ -129,9 +121,7 @@ def test_known_movers_do_not_bias_poses():
 )
 def test_sensor_extrinsics(x, y, yaw):
     # all round: wherever the sensor looks, it sees the same world
-    plain = LaserOptions(beams=240, fov=2 * np.pi, range_noise=0.005, max_range=8.0, x=0.0)
-    there = dataclasses.replace(plain, x=x, y=y, yaw=yaw)
-    a, b = small_room(plain), small_room(there)
+    a, b = small_room(ALL_ROUND | {"x": 0.0}), small_room(ALL_ROUND | {"x": x, "y": y, "yaw": yaw})
     np.testing.assert_array_equal(a.truth.T_world_base, b.truth.T_world_base)
     assert not np.array_equal(a.recording.points, b.recording.points)
     of_a, of_b = build(a.recording), build(b.recording)
@@ -145,9 +135,8 @@ def test_sensor_extrinsics(x, y, yaw):
 
 def test_two_sensors_on_one_robot():
     # in turns, one turned round: each scan goes by its own sensor's place on the robot
-    ahead = LaserOptions(beams=240, fov=2 * np.pi, range_noise=0.005, max_range=8.0, x=0.2)
-    behind = dataclasses.replace(ahead, x=-0.25, yaw=np.pi)
-    one, other = small_room(ahead), small_room(behind)
+    ahead, behind = {"x": 0.2}, {"x": -0.25, "yaw": np.pi}
+    one, other = small_room(ALL_ROUND | ahead), small_room(ALL_ROUND | behind)
     sensor = (np.arange(60) % 2).astype(np.int32)
     of_beam = np.repeat(sensor, np.diff(one.recording.offset))
     both = dataclasses.replace(

@@ -7,12 +7,11 @@ from itertools import accumulate
 import numpy as np
 import pytest
 from marks import slow_params
+from rooms import drive
 
 from stillmap.core import se2
 from stillmap.results.eval.trajectory import compute_absolute_errors
-from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.sim.walls import box
+from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import SlamOptions, m_step, odometry_2d
 
 OPTIONS = SlamOptions()
@@ -30,16 +29,7 @@ def followed(recording):
 @functools.cache
 def room():
     """Ahead, a quarter turn from scan 48 on, and ahead again."""
-    scene = Scene(
-        "room",
-        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(range_noise=0.01, max_range=8.0),
-        robot=RobotOptions(scans=80),
-        odometry=OdometryOptions(),
-    )
-    return simulate(scene, 2)
+    return drive(2, laser={"range_noise": 0.01, "max_range": 8.0}, robot={"scans": 80})
 
 
 def survived(T_odom_base):

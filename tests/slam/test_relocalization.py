@@ -5,12 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from marks import slow_params
+from rooms import drive
 
 from stillmap.core import se2
 from stillmap.results.eval.trajectory import compute_absolute_errors
-from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.sim.walls import box
+from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import SlamOptions, m_step
 
 OPTIONS = SlamOptions()
@@ -80,16 +79,8 @@ def one_after_the_other(a, b):
 
 def test_return_to_the_same_room():
     # carried back to where it was, turned about: 5 m from where odometry goes on
-    room = Scene(
-        "room",
-        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(beams=120, range_noise=0.01, max_range=20.0),
-        robot=RobotOptions(scans=60),
-        odometry=OdometryOptions(),
-    )
-    once = simulate(room, 2)
+    laser = {"beams": 120, "range_noise": 0.01, "max_range": 20.0}
+    once = drive(2, laser=laser, robot={"scans": 60})
     found = mapped(one_after_the_other(once.recording, once.recording))
     assert found.diagnostics.breaks == [60]
     assert found.diagnostics.unconnected == []

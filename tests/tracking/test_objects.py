@@ -5,10 +5,9 @@ import functools
 
 import numpy as np
 import pytest
+from rooms import drive
 
 from stillmap.core import arrays
-from stillmap.sim import RobotOptions, Scene, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
 from stillmap.tracking import ObjectOptions, compute_flow_map, joins, track_objects, tracklets
 from stillmap.tracking.objects import estimate_center_offset, measure_box
@@ -18,16 +17,9 @@ OPTIONS = ObjectOptions()
 
 @functools.cache
 def room(people=6, shape="bodies"):
-    scene = Scene(
-        "room",
-        walls=(*box(0, 0, 16, 12), *box(3, 2, 0.6, 0.6)),
-        route=((-6, -4), (6, -4), (6, 4)),
-        crowd=CrowdOptions(people=people, shape=shape),
-        laser=LaserOptions(beams=181, max_range=20.0),
-        robot=RobotOptions(),
-        odometry=OdometryOptions(),
-    )
-    return simulate(scene, 3)
+    walls, route = (*box(0, 0, 16, 12), *box(3, 2, 0.6, 0.6)), ((-6, -4), (6, -4), (6, 4))
+    crowd = {"people": people, "shape": shape}
+    return drive(3, walls, route, crowd=crowd, laser={"beams": 181, "max_range": 20.0})
 
 
 def labels(simulation):

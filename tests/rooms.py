@@ -1,0 +1,18 @@
+"""Simulated runs through a small room, or among other walls."""
+
+from typing import Any
+
+from stillmap.core.config import override
+from stillmap.sim import Scene, Simulation, simulate
+from stillmap.sim.walls import box
+
+ROOM = (*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4))
+ROUTE = ((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5))
+
+
+def drive(
+    seed: Any, walls: Any = ROOM, route: Any = ROUTE, people: int = 0, **sections: Any
+) -> Simulation:
+    """A run along a route; `sections` change the options of the scene, as laser={...}."""
+    scene = Scene("room", walls=tuple(walls), route=tuple(route))
+    return simulate(override(scene, {"crowd": {"people": people}, **sections}), seed)
