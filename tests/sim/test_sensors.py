@@ -45,14 +45,6 @@ def test_whoever_knows_it_sees_the_same_place() -> None:
     assert sensor["angle_step"] == pytest.approx(-np.pi / 60)
 
 
-def test_whoever_does_not_know_it_sees_its_mirror_image() -> None:
-    known, unknown = taken(upside_down="known"), taken(upside_down="unknown")
-    np.testing.assert_allclose(
-        unknown.recording.points * np.float32([1, -1]), known.recording.points, atol=1e-5
-    )
-    np.testing.assert_array_equal(unknown.recording.T_odom_base, known.recording.T_odom_base)
-
-
 @pytest.mark.parametrize("sweep_time", [0.0, 0.2])
 def test_a_second_laser_looks_backwards_by_turns(sweep_time: float) -> None:
     run = taken(second_laser=True, sweep_time=sweep_time, scans=100)

@@ -51,13 +51,6 @@ def test_more_sessions_leave_the_first_ones_as_they_are() -> None:
         assert one.things == other.things
 
 
-@pytest.mark.slow
-def test_a_plan_follows_from_its_seed() -> None:
-    again = plan_sessions(quick_scene(), 3, 2)
-    assert again == quick_plan()
-    assert plan_sessions(quick_scene(), 3, 3) != again
-
-
 def test_sessions_differ_in_start_mount_sensor_and_day() -> None:
     plan = quick_plan(4)
     starts = np.array([scene.route[0] for scene in plan.scenes])
