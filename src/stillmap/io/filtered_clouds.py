@@ -30,7 +30,7 @@ FilterFile = Callable[[Path, Path, Mask], None]
 
 
 def write_kitti(job: FilterJob) -> Omissions:
-    """Copy a folder with points removed, and with their labels where it has those of SemanticKITTI.
+    """Copy a KITTI folder with points removed, and their labels where it has SemanticKITTI's.
 
     Scans that were not read become empty files: numbers of scans, stamps, poses and images still
     belong together.
@@ -52,7 +52,7 @@ def write_kitti(job: FilterJob) -> Omissions:
 
 
 def write_pcd(job: FilterJob) -> Omissions:
-    """Copy a file or folder; points of organised clouds become NaN, others are removed."""
+    """Copy a PCD file or folder; points of organised clouds become NaN, others are removed."""
 
     def read_layout(path: Path) -> TableLayout:
         return pcd.read_header(path).layout
@@ -61,7 +61,7 @@ def write_pcd(job: FilterJob) -> Omissions:
 
 
 def write_ply(job: FilterJob) -> Omissions:
-    """Copy a file or folder; vertices are removed, or become NaN where other elements, such as
+    """Copy a PLY file or folder; vertices are removed, or become NaN where other elements, such as
     faces, may refer to them by their number."""
     return _write_tables(job, ply.EXTENSIONS, ply.read_layout, {b"element vertex": 2})
 
@@ -82,7 +82,7 @@ def _write_tables(
 
 
 def write_las(job: FilterJob) -> Omissions:
-    """Copy a file or folder with points removed: version, format of points and records stay."""
+    """Copy a LAS or LAZ file or folder without some points; version, format and records stay."""
     ending = job.output.suffix.lower()
     packed = ending == ".laz" if job.source.is_file() and ending in las.EXTENSIONS else None
     filter_file = partial(_filter_las, packed=packed)
