@@ -16,7 +16,6 @@ from typing import Any
 from stillmap.core.errors import InputError
 
 _BUFFER = 1 << 16  # bytes read at once
-_PIECE = 1 << 20  # bytes copied at once
 
 
 class ShorterFileError(InputError):
@@ -143,8 +142,7 @@ def copy_content(source: str | os.PathLike[str], target: str | os.PathLike[str])
         OSError: the target cannot be written.
     """
     with InputFile(source) as file, open(target, "wb") as copy:
-        while piece := file.read(_PIECE):
-            copy.write(piece)
+        shutil.copyfileobj(file, copy)
 
 
 def copy_file(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
