@@ -80,55 +80,40 @@ class MeshInputs:
         b = int(np.searchsorted(stamps, last + slack, side="right")) + _SCANS_AROUND
         return slice(max(a, 0), min(b, len(stamps)))
 
+    @cached_property
+    def _owned(self) -> list[tuple[TrackedBox, Index]]:
+        """Boxes with the beams of their objects."""
+        beams = {one.id: one.beams for one in self.objects}
+        return [(one, beams[one.box.object_id]) for one in self.boxes if one.box.object_id in beams]
 
-class LidarReturns:
-    """Returns of a 3D recording, looked up by time.
+    @cached_property
+    def _on_dynamic_object(self) -> Bool:
+        """(M,) whether a beam ended on an object and is rather dynamic."""
+        out = np.zeros(len(self.p_static), np.bool_)
+        for _, owned in self._owned:
+            out[owned] = self.p_static[owned] < 0.5
+        return out
 
-    Attributes:
-        inputs: the recording.
-    """
-
-    def __init__(self, inputs: MeshInputs) -> None:
-        self.inputs = inputs
-        beams = {one.id: one.beams for one in inputs.objects}
-        self._owned = [
-            (one, beams[one.box.object_id]) for one in inputs.boxes if one.box.object_id in beams
-        ]
-
-    def near_time(self, stamp_ns: int) -> tuple[Float, Float32]:
+    def returns_near(self, stamp_ns: int) -> tuple[Float, Float32]:
         """Returns near a time; those on tracked objects moved along their track to that time.
 
         Returns:
             (n, 3) metres in the map frame, and P(static) (n,).
         """
-        inputs, deskewed = self.inputs, self.inputs.deskewed
-        window = _WINDOW_TILTING if inputs.is_planar else _WINDOW
-        tracked = _WINDOW_TRACKED if inputs.is_planar else window
-        now = 1e-9 * (stamp_ns - inputs.start_ns)
-        scans = inputs.scans_within(now - tracked, now + tracked)
-        beams = np.arange(deskewed.offset[scans.start], deskewed.offset[scans.stop])
-        away = np.abs(inputs.seconds_of(beams) - now)
+        window = _WINDOW_TILTING if self.is_planar else _WINDOW
+        tracked = _WINDOW_TRACKED if self.is_planar else window
+        now = 1e-9 * (stamp_ns - self.start_ns)
+        scans = self.scans_within(now - tracked, now + tracked)
+        beams = np.arange(self.deskewed.offset[scans.start], self.deskewed.offset[scans.stop])
+        away = np.abs(self.seconds_of(beams) - now)
         # at least the nearest, as scans without per-beam times share one stamp
         near = away <= max(window, float(away.min(initial=np.inf))) + _CLOCK_ERROR
-        if inputs.is_planar:
+        if self.is_planar:
             near |= (away <= tracked) & self._on_dynamic_object[beams]
-        beams = beams[deskewed.hit[beams] & near]
-        ends = deskewed.end_points(beams, inputs.poses)
-        self._compensate_motion(ends, beams, now)
-        return ends, inputs.p_static[beams]
-
-    @cached_property
-    def _on_dynamic_object(self) -> Bool:
-        """(M,) whether a beam ended on an object and is rather dynamic."""
-        p_static = self.inputs.p_static
-        out = np.zeros(len(p_static), np.bool_)
-        for _, owned in self._owned:
-            out[owned] = p_static[owned] < 0.5
-        return out
-
-    def _compensate_motion(self, ends: Float, beams: Index, now: float) -> None:
-        """Moves end points (n, 3) on tracked objects along the tracks to a time; in place."""
-        for box, owned in self._owned:
-            first, last = np.searchsorted(owned, beams[[0, -1]]) if len(beams) else (0, -1)
+        beams = beams[self.deskewed.hit[beams] & near]
+        ends = self.deskewed.end_points(beams, self.poses)
+        for box, owned in self._owned if len(beams) else ():
+            first, last = np.searchsorted(owned, beams[[0, -1]])
             mine = np.flatnonzero(np.isin(beams, owned[first : last + 1]))
-            ends[mine, :2] += box.motion_until(now, self.inputs.seconds_of(beams[mine]))
+            ends[mine, :2] += box.motion_until(now, self.seconds_of(beams[mine]))
+        return ends, self.p_static[beams]

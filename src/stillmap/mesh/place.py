@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.inputs import LidarReturns, MeshInputs
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.texture import sample_bilinear
 from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
 from stillmap.mesh.triangle_mesh import (
@@ -105,14 +105,14 @@ def assign_views(
     """
     if views:
         mesh, _ = subdivide(mesh, partial(max_edge_at, views))
-    returns, areas = LidarReturns(inputs), mesh.areas()
+    areas = mesh.areas()
     candidates = Candidates.empty(len(mesh), min(CANDIDATES, max(len(views), 1)))
     visible = np.zeros(len(mesh), np.bool_)
 
     def evaluate(view: View) -> tuple[Index, Float, Float]:
         pixels = find_visible_faces(mesh, view)
         faces = np.flatnonzero(pixels)
-        p = p_unoccluded(mesh, faces, view, returns) if len(faces) else np.zeros(0)
+        p = p_unoccluded(mesh, faces, view, inputs) if len(faces) else np.zeros(0)
         return faces, pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
@@ -153,7 +153,7 @@ def resolve_assignment(mesh: Mesh, candidates: Candidates, visible: Bool) -> Vie
     return ViewAssignment(mesh, view, p_static, visible)
 
 
-def p_unoccluded(mesh: Mesh, faces: Index, view: View, returns: LidarReturns) -> Float:
+def p_unoccluded(mesh: Mesh, faces: Index, view: View, inputs: MeshInputs) -> Float:
     """(n,) probability that a view shows static surface only at faces (n,).
 
     From the returns near its timestamp, and where there are none from the boxes of moving objects;
@@ -161,9 +161,9 @@ def p_unoccluded(mesh: Mesh, faces: Index, view: View, returns: LidarReturns) ->
     """
     part = mesh.subset(faces)
     points = np.concatenate([part.vertices, part.centers])
-    there = boxes_at(returns.inputs.boxes, 1e-9 * (view.stamp_ns - returns.inputs.start_ns))
+    there = boxes_at(inputs.boxes, 1e-9 * (view.stamp_ns - inputs.start_ns))
     free = 1.0 - occlusion_probability(there, view.position, points)
-    ends, p_static = returns.near_time(view.stamp_ns)
+    ends, p_static = inputs.returns_near(view.stamp_ns)
     # a laser sees past an object what the camera beside it does not see
     informative = (p_static < 0.5) | ~is_in_or_behind_box(there, view.position, ends)
     mask = build_occlusion_mask(view, ends[informative], p_static[informative])

@@ -29,7 +29,7 @@ from stillmap.mesh.registration import (
 from stillmap.mesh.segmentation import HALF_CAR, DynamicReturns, find_best_interval
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import Float, Index, Mesh, subdivide
-from stillmap.mesh.tsdf import TsdfParameters, integrate_patches
+from stillmap.mesh.tsdf import integrate_patches
 
 MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it
 _MAX_VIEW_OFFSET = 0.05  # m of a partial surface from the best one: else it is left out
@@ -43,7 +43,8 @@ _MIN_RETURN_HEIGHT = 0.1  # m above its bottom of these returns: lower ones may 
 _SAMPLE_SHARE = 0.5  # of that distance between samples of the surface
 _MIN_VOXEL, _MAX_VOXEL = 0.03, 0.06  # m
 _VOXEL_SHARE = 0.7  # of the beam spacing
-_TRUNCATION_FRONT, _TRUNCATION_BACK = 6.0, 5.0  # voxels: partial surfaces are a few apart
+_TRUNCATION = 6.0, 5.0  # voxels: partial surfaces are a few apart
+_MAX_FACES = 200_000  # of an object
 _MIN_VIEWS, _MIN_VIEW_SHARE = 1.5, 0.4  # partial surfaces of a voxel, or share where there are few
 _MERGE_DEPTH = 1.0  # m along the line of sight that one of several partial surfaces may bridge
 _MIN_VERTICES = 200  # of the best partial surface: fewer do not tell how others fit
@@ -217,14 +218,14 @@ def _make_surface(scan: PartialScan, now: float) -> PartialSurface:
 
 def _fuse_patches(patches: Sequence[Patch]) -> Mesh:
     """One surface of several partial surfaces, by TSDF integration."""
-    parameters = TsdfParameters(
-        truncation_front=_TRUNCATION_FRONT,
-        truncation_back=_TRUNCATION_BACK,
+    return integrate_patches(
+        [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches],
+        object_voxel_size(patches),
+        truncation=_TRUNCATION,
         min_weight=min(_MIN_VIEWS, _MIN_VIEW_SHARE * len(patches)),
-        min_component_area=MIN_COMPONENT_AREA,
+        min_area=MIN_COMPONENT_AREA,
+        max_faces=_MAX_FACES,
     )
-    weighted = [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches]
-    return integrate_patches(weighted, object_voxel_size(patches), parameters)
 
 
 def object_voxel_size(patches: Sequence[Patch]) -> float:

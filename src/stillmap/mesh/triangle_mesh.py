@@ -174,7 +174,6 @@ _K = 3.0
 
 _ERROR_GROWTH = 2.0  # factor by which the error grows while there are too many triangles
 _MAX_GROWTHS = 24
-_STALLED = 0.9  # share of the triangles left from which on more error does not help
 
 _SUBDIVISION_ROUNDS = 12  # each halves the longest edges
 
@@ -213,22 +212,15 @@ def simplify(mesh: Mesh, error: float, *, whole_border: bool = True, most: int =
     return Mesh(np.array(vertices, np.float64), np.array(faces, np.int32).reshape(-1, 3))
 
 
-def simplify_to_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = False) -> Mesh:
-    """Simplifies a mesh to at most `most` triangles with a growing error; borders go last.
-
-    With `whole_border` they stay, and there may be more triangles.
-    """
+def simplify_to_budget(mesh: Mesh, error: float, most: int) -> Mesh:
+    """Simplifies a mesh to at most `most` triangles with a growing error; borders go last."""
     for _ in range(_MAX_GROWTHS):
-        before = len(mesh)
-        if before <= most:
+        if len(mesh) <= most:
             break
         error *= _ERROR_GROWTH
         mesh = simplify(mesh, error, most=most)
-        if not whole_border:
-            # else the surface inside would have to make up for ragged borders
-            mesh = simplify(mesh, error, whole_border=False, most=most)
-        elif len(mesh) > _STALLED * before:
-            break
+        # else the surface inside would have to make up for ragged borders
+        mesh = simplify(mesh, error, whole_border=False, most=most)
     return mesh
 
 

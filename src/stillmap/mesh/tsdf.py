@@ -6,7 +6,7 @@ Curless and Levoy, "A Volumetric Method for Building Complex Models from Range I
 
 from collections.abc import Callable, Iterable
 from itertools import chain, product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,26 +147,8 @@ def min_voxel_size(recording: Recording, poses: Float) -> float:
 _MIN_P_STATIC = 0.8  # product over a triangle's beams; below, a beam has little but its prior
 TILE = 64  # voxels along a tile, whole blocks
 _MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
-_MERGE_FACES = 250_000  # triangles that wait to be merged
-_SPARE = 2  # times the triangle budget, while the surface grows
-
-
-class TsdfParameters(NamedTuple):
-    """Parameters of TSDF integration; the defaults are those of the static surface.
-
-    Attributes:
-        truncation_front: voxels in front of a surface in which distances are stored.
-        truncation_back: voxels behind it.
-        min_weight: voxels need more weight than this.
-        min_component_area: square metres; smaller connected components are dropped.
-        max_faces: triangle budget, whatever the error.
-    """
-
-    truncation_front: float = 3.0
-    truncation_back: float = 2.0
-    min_weight: float = 0.0
-    min_component_area: float = 0.05
-    max_faces: int = 200_000
+_TRUNCATION = 3.0, 2.0  # voxels in front of a surface and behind it
+_MIN_AREA = 0.05  # m2: smaller connected components are dropped
 
 
 def build_surface(
@@ -208,14 +190,19 @@ def build_surface(
     def tell_later(done: int, total: int) -> None:
         tell(n + n * done // total, 2 * n)
 
-    parameters = TsdfParameters(max_faces=options.max_faces)
-    return integrate_patches(patches(), voxel, parameters, threads, tell_later)
+    return integrate_patches(
+        patches(), voxel, max_faces=options.max_faces, threads=threads, tell=tell_later
+    )
 
 
 def integrate_patches(
     patches: Iterable[tuple[Patch, Float32]],
     voxel: float,
-    parameters: TsdfParameters,
+    *,
+    truncation: tuple[float, float] = _TRUNCATION,
+    min_weight: float = 0.0,
+    min_area: float = _MIN_AREA,
+    max_faces: int,
     threads: int = 1,
     tell: Tell = no_tell,
 ) -> Mesh:
@@ -224,41 +211,27 @@ def integrate_patches(
     Args:
         patches: each with the weights (m,) of its faces; those of weight 0 are left out.
         voxel: edge in metres.
-        parameters: see TsdfParameters.
+        truncation: voxels in front of and behind a surface in which distances are stored.
+        min_weight: voxels need more weight than this.
+        min_area: square metres; smaller connected components are dropped.
+        max_faces: triangle budget.
         threads: same result with any number.
         tell: called with the tiles done and the total, after integration.
     """
-    volume = _core.TsdfVolume(
-        voxel,
-        truncation_front=parameters.truncation_front * voxel,
-        truncation_back=parameters.truncation_back * voxel,
-    )
+    front, back = (voxel * share for share in truncation)
+    volume = _core.TsdfVolume(voxel, truncation_front=front, truncation_back=back)
     for patch, weight in patches:
         volume.integrate(
             patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
         )
-    return _extract_surface(volume, parameters, tell)
-
-
-def _extract_surface(volume: _core.TsdfVolume, parameters: TsdfParameters, tell: Tell) -> Mesh:
-    """The whole mesh within the budget, tile by tile."""
-    error = simplification_error(volume.voxel)
-    mesh, waiting = Mesh.empty(), list[Mesh]()
+    error = simplification_error(voxel)
     tiles, _ = unique_cells(volume.blocks() // (TILE // volume.block_edge))
+    parts = list[Mesh]()
     for done, tile in enumerate(tiles, start=1):
-        part = extract_tile(volume, tile, parameters.min_weight)
-        waiting.append(simplify(part, error))
-        if done == len(tiles) or sum(map(len, waiting)) > max(_MERGE_FACES, len(mesh)):
-            mesh = weld(concatenate_meshes([mesh, *waiting]))
-            waiting = []
-            if len(mesh) > _MERGE_FACES:
-                # the border stays, as more tiles may join it
-                mesh = simplify(mesh, error)
-                most = _SPARE * parameters.max_faces
-                mesh = simplify_to_budget(mesh, error, most, whole_border=True)
+        parts.append(simplify(extract_tile(volume, tile, min_weight), error))
         tell(done, len(tiles))
-    mesh = remove_small_components(mesh, parameters.min_component_area)
-    return simplify_to_budget(simplify(mesh, error), error, parameters.max_faces)
+    mesh = remove_small_components(weld(concatenate_meshes(parts)), min_area)
+    return simplify_to_budget(simplify(mesh, error), error, max_faces)
 
 
 def static_weights(patch: Patch, p_static: Float32) -> Float32:

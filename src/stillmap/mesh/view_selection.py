@@ -23,7 +23,6 @@ _OCCLUSION_WEIGHT = 10.0  # e-folds of resolution per e-fold of that probability
 _ITERATIONS = 20  # of belief propagation
 _DAMPING = 0.5  # share of a message that is kept per iteration, against oscillation
 _MIN_POSITIVE = 1e-6  # keeps logarithms finite
-_PAIRS_PER_BLOCK = 1 << 17
 _MIN_IMAGES = 3  # of a face: of two images neither is the outlier
 _DARK, _BRIGHT = 16.0, 240.0  # of 255: beyond these a value may be clipped
 _MIN_FACES = 30  # that two images must share
@@ -103,9 +102,7 @@ def select_views(candidates: Candidates, pairs: Int32, seam_cost: float) -> Int3
     messages = np.zeros((2, len(pairs), K), np.float32)  # to the second face, and to the first
     belief = cost
     for _ in range(_ITERATIONS):
-        for first in range(0, len(pairs), _PAIRS_PER_BLOCK):
-            part = slice(first, first + _PAIRS_PER_BLOCK)
-            _update_messages(candidates.view, belief, pairs[part], messages[:, part], seam_cost)
+        _update_messages(candidates.view, belief, pairs, messages, seam_cost)
         belief = cost.copy()
         for way, receiver in enumerate(pairs.T[::-1]):
             for k in range(K):

@@ -5,7 +5,7 @@ import pytest
 from made_up_rooms import looking, rectangle
 from recordings import of_one_sensor
 
-from stillmap.mesh.inputs import LidarReturns, MeshInputs
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import _P_UNOBSERVED, p_unoccluded
 from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.view_selection import MIN_P_VISIBLE
@@ -40,7 +40,7 @@ def person(x, y):
 def probabilities(found, things):
     recording, T, p = found
     inputs = MeshInputs(recording, recording, T, p, [], things, 0)
-    return p_unoccluded(WALL, np.arange(len(WALL)), VIEW, LidarReturns(inputs))
+    return p_unoccluded(WALL, np.arange(len(WALL)), VIEW, inputs)
 
 
 def on_wall():

@@ -8,7 +8,7 @@ from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.mesh import inputs
-from stillmap.mesh.inputs import LidarReturns, MeshInputs
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking.boxes import Box
 
@@ -28,15 +28,15 @@ def _recording(times: np.ndarray | None) -> Recording:
 
 def _returns(
     recording: Recording, poses: np.ndarray, p: np.ndarray, box: Box | None, owned: np.ndarray
-) -> LidarReturns:
+) -> MeshInputs:
     objects = [SimpleNamespace(id=0, beams=owned)]
     boxes = [] if box is None else [TrackedBox(box, np.zeros(2), 1.0)]
-    return LidarReturns(MeshInputs(recording, recording, poses, p, objects, boxes, 0))
+    return MeshInputs(recording, recording, poses, p, objects, boxes, 0)
 
 
 def _beams(
     recording: Recording, box: Box | None = None, owned: np.ndarray | None = None
-) -> LidarReturns:
+) -> MeshInputs:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 1, 3] = [0.0, 10.0, 20.0, 30.0]
     p = np.linspace(0.0, 1.0, 12).astype(np.float32)
@@ -44,7 +44,7 @@ def _beams(
 
 
 def near_time(
-    beams: LidarReturns,
+    beams: MeshInputs,
     stamp_ns: int,
     window: float,
     tilting: float | None = None,
@@ -53,7 +53,7 @@ def near_time(
     """The returns near a time, by windows in seconds."""
     windows = {"_WINDOW": window, "_WINDOW_TILTING": tilting or window, "_WINDOW_TRACKED": tracked}
     with mock.patch.multiple(inputs, **windows):
-        return beams.near_time(stamp_ns)
+        return beams.returns_near(stamp_ns)
 
 
 def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
@@ -87,7 +87,7 @@ def test_what_is_of_a_thing_goes_on_with_it() -> None:
     np.testing.assert_allclose(ends, [[4, 10, 0], [5.04, 10.08, 0], [6, 10, 0]], atol=1e-6)
 
 
-def _row(p: list[float], planar: bool) -> LidarReturns:
+def _row(p: list[float], planar: bool) -> MeshInputs:
     """Four rows, 0.1 s apart; beams 0, 3, 6, 9 are of a thing that goes 1 m/s along y."""
     box = Box(
         0,
@@ -101,7 +101,7 @@ def _row(p: list[float], planar: bool) -> LidarReturns:
     poses, of_all = np.tile(np.eye(4), (4, 1, 1)), np.ones(12, np.float32)
     of_all[::3] = p
     out = _returns(_recording(None), poses, of_all, box, np.array([0, 3, 6, 9]))
-    out.inputs.__dict__["is_planar"] = planar
+    out.__dict__["is_planar"] = planar
     return out
 
 
