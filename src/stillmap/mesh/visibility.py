@@ -182,6 +182,7 @@ _BEAM_DIVERGENCE = 0.01  # m per metre by which the footprint of a return grows
 _SUPPORT_SIGMA = 1.5  # cells over which a static return supports its neighbors
 _MIN_DEPTH = 0.05  # m from the camera: nearer returns are the camera itself
 _MAX_RADIUS = 12  # cells by which a return is dilated
+_CELLS_PER_ROW = 1 << 31  # also outside the image
 
 
 class OcclusionMask(NamedTuple):
@@ -256,10 +257,10 @@ def _count_support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
 
 def _nearest_per_cell(at: Float, away: Float) -> Index:
     """Numbers of the nearest points (n, 2) of each cell."""
-    cells = np.floor(at).astype(np.int64)
-    order = np.lexsort((away, cells[:, 0], cells[:, 1]))
-    new = np.any(np.diff(cells[order], axis=0, prepend=cells[order[:1]] - 1) != 0, axis=1)
-    return order[new]
+    column, row = np.floor(at).astype(np.int64).T
+    order = np.argsort(away, kind="stable")
+    _, first = np.unique((row * _CELLS_PER_ROW + column)[order], return_index=True)
+    return order[first]
 
 
 def _draw_discs(
@@ -275,18 +276,14 @@ def _draw_discs(
         radius: (n,) in cells, at most `_MAX_RADIUS` counts.
     """
     h, w = depth.shape
-    radius = np.minimum(radius, _MAX_RADIUS)
-    parts = []
-    for whole in range(_MAX_RADIUS + 1):
-        of = np.flatnonzero(np.ceil(radius - 0.5).astype(np.intp) == whole)
-        dy, dx = np.mgrid[-whole : whole + 1, -whole : whole + 1]
-        disc = dx**2 + dy**2 <= (whole + 0.5) ** 2
-        column = np.floor(at[of, 0]).astype(np.intp)[:, None] + dx[disc]
-        row = np.floor(at[of, 1]).astype(np.intp)[:, None] + dy[disc]
-        inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        point = np.repeat(of, inside.sum(axis=1))
-        parts.append(np.stack([(row * w + column)[inside], point], axis=1))
-    cell, point = np.concatenate(parts).T
+    whole = np.ceil(np.minimum(radius, _MAX_RADIUS) - 0.5)
+    steps = np.arange(-_MAX_RADIUS, _MAX_RADIUS + 1)
+    dx, dy = (a.ravel() for a in np.meshgrid(steps, steps))
+    point, step = np.nonzero(dx**2 + dy**2 <= (whole[:, None] + 0.5) ** 2)
+    column, row = np.floor(at[point]).astype(np.intp).T
+    column, row = column + dx[step], row + dy[step]
+    inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+    cell, point = (row * w + column)[inside], point[inside]
     order = np.lexsort((point, -away[point]))  # the nearest is written last
     depth.flat[cell[order]] = away[point[order]]
     dynamic.flat[cell[order]] = p_dynamic[point[order]]
