@@ -18,7 +18,6 @@ foxglove = pytest.importorskip("foxglove")
 from foxglove_client import Client, Schemas, grid_of, points_of, pose_of, stamp_of  # noqa: E402
 
 from stillmap.cli.main import main  # noqa: E402
-from stillmap.core.errors import MissingExtra  # noqa: E402
 from stillmap.core.grid_map import GridMap  # noqa: E402
 from stillmap.em import CellProbabilities  # noqa: E402
 from stillmap.live import foxglove_server  # noqa: E402
@@ -282,15 +281,6 @@ def test_calls_that_make_no_sense(hall, tmp_path, capsys, words, expected):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert expected in said
-
-
-def test_without_the_library(hall, tmp_path, monkeypatch, capsys):
-    def fail(name, *_, **__):
-        raise MissingExtra(f"the live view needs {name}")
-
-    monkeypatch.setattr("stillmap.cli.live.import_extra", fail)
-    assert main(["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--foxglove"]) == 2
-    assert "needs foxglove" in capsys.readouterr().err
 
 
 def test_the_result_is_the_same_as_without(hall, tmp_path, capsys):

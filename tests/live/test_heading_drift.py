@@ -51,32 +51,6 @@ def test_walls_at_another_angle_say_nothing(walls):
     assert walls.measure(scan, turned(17.0)) is None
 
 
-def test_directions_of_all_kinds_say_hardly_anything():
-    walls, rng = WallDirections(), np.random.default_rng(0)
-    for _ in range(40):
-        walls.add(look(rng.uniform(0.0, 360.0, 120)), np.eye(3), 0.5)
-    offset = walls.measure(look(rng.uniform(0.0, 360.0, 120)), np.eye(3))
-    assert offset is None or np.sqrt(offset.variance) > np.radians(1.0)
-
-
-def test_what_moves_does_not_count(walls):
-    assert walls.measure(look(rectangular(np.random.default_rng(1)), 0.0), turned(17.0)) is None
-
-
-def test_nothing_is_said_before_directions_are_known():
-    walls, scan = WallDirections(), look(rectangular(np.random.default_rng(0)))
-    walls.add(scan, np.eye(3), 0.5)
-    assert walls.measure(scan, np.eye(3)) is None
-
-
-@pytest.mark.parametrize("angle", [0.7, -31.3, 95.0])
-def test_directions_turn_with_their_frame(walls, angle):
-    walls.rotate(np.radians(angle))
-    scan = look(rectangular(np.random.default_rng(1)))
-    offset = walls.measure(scan, turned(17.0 + angle - 1.0))
-    assert np.degrees(offset.value) == pytest.approx(1.0, abs=0.3)
-
-
 def test_a_heading_takes_the_position_along():
     covariance = np.array([[0.04, 0.0, 0.01], [0.0, 0.04, 0.0], [0.01, 0.0, 0.01]])
     T = correct_heading(np.eye(3), covariance, HeadingOffset(0.1, 0.01))

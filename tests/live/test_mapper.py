@@ -188,16 +188,6 @@ def test_without_odometry(corridor):
     assert compute_absolute_errors(poses, corridor.truth.T_world_base[:150]).rmse < 0.06
 
 
-def test_odometry_that_leaps_is_not_believed(corridor, fresh):
-    mapper = fresh()
-    odometry, leap = corridor.recording.T_odom_base, se2.matrix(5.0, -3.0, 1.0)
-    poses = []
-    for t, beams in zip(range(120), iter_beams(corridor.recording), strict=False):
-        poses.append(mapper.push(beams, leap @ odometry[t] if t >= 60 else odometry[t]).pose)
-    errors = compute_absolute_errors(np.array(poses), corridor.truth.T_world_base[:120])
-    assert errors.max < 0.2
-
-
 def test_late_scans_are_refused_and_change_nothing(corridor, fresh):
     mapper = fresh()
     first, second = [b for _, b in zip(range(2), iter_beams(corridor.recording), strict=False)]
