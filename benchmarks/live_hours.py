@@ -59,7 +59,7 @@ def main() -> None:
             ms.append(1e3 * (time.perf_counter() - due))
             mapper.update_map()
             if (n + 1) % every == 0 or n + 1 == count:
-                child = str(mapper._slam.frame._closer._process.id)
+                child = str(mapper._slam.frame._closer._process.pid)
                 memory = _memory(child, of_recording)
                 lines.append([*_line(n + 1, period, ms[-every:], late), *memory])
                 print(" | ".join(lines[-1]), flush=True)
