@@ -12,15 +12,6 @@ from stillmap.io import read, stillmap_folder
 QUICK = ("--set", "em.max_iterations=1", "--quiet")
 
 
-@pytest.fixture(scope="module")
-def mapped(stillmap, room, tmp_path_factory):
-    """The result of mapping the room."""
-    out = tmp_path_factory.mktemp("filtered") / "out"
-    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=1", "--quiet")
-    assert done.returncode == 0, done.stderr
-    return out
-
-
 @pytest.mark.parametrize("below", [None, 0.9, 0.0])
 def test_dynamic_beams_become_misses(call, room, mapped, tmp_path, below):
     more = [] if below is None else ["--below", below]
@@ -150,13 +141,6 @@ def test_refusals(call, room, mapped, tmp_path):
     assert not (tmp_path / "c").exists()
 
 
-def test_parent_folders_are_created(call, mapped, tmp_path):
-    refused(call("filter", tmp_path / "none", "-o", tmp_path / "a/b/clean"), "run.json")
-    assert not list(tmp_path.iterdir())
-    assert call("filter", mapped, "-o", tmp_path / "a/b/clean").returncode == 0
-    assert read(tmp_path / "a/b/clean").n_scans == 40
-
-
 def test_inputs_are_never_overwritten(call, room, mapped, tmp_path):
     shutil.copytree(room, tmp_path / "all/room")
     (tmp_path / "all/precious").write_text("")
@@ -167,11 +151,6 @@ def test_inputs_are_never_overwritten(call, room, mapped, tmp_path):
     assert (tmp_path / "all/precious").exists()
     before, after = stillmap_folder.read(room), stillmap_folder.read(tmp_path / "all/room")
     np.testing.assert_array_equal(before.hit, after.hit)
-
-
-def test_overwrite_flag(call, mapped, tmp_path):
-    for more, status in (((), 0), ((), 2), (("--overwrite",), 0)):
-        assert call("filter", mapped, "-o", tmp_path / "clean", *more).returncode == status
 
 
 @pytest.mark.parametrize(

@@ -208,6 +208,15 @@ def test_what_was_finished_is_kept_where_its_place_is_taken(tmp_path):
     assert content(kept) == NEW
 
 
+def test_errors_about_unfinished_work_name_the_output(tmp_path):
+    with pytest.raises(InputError) as failed, atomic_folder(tmp_path / "out", "mark") as work:
+        raise InputError("is bad", where=f"{work}/a.pcd:3")
+    assert failed.value.where == f"{tmp_path}/out/a.pcd:3"
+    with pytest.raises(InputError) as failed, atomic_file(tmp_path / "file") as work:
+        raise InputError("is bad", where=str(work))
+    assert failed.value.where == f"{tmp_path}/file"
+
+
 def test_file_that_appears_meanwhile_stays(tmp_path):
     path = tmp_path / "file"
     with pytest.raises(InputError, match="has appeared meanwhile"):
