@@ -8,14 +8,22 @@ All beams of a cell share its fate, so few cells make many beams: what a perfect
 would show in the same cells stands beside what was found.
 """
 
-import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from cases import POPULATED, STOPS
-from common import Run, add_arguments, add_run_arguments, built, options_of, outcomes, runs_of
+from common import (
+    Run,
+    add_arguments,
+    add_run_arguments,
+    built,
+    make_parser,
+    options_of,
+    outcomes,
+    runs_of,
+)
 from numpy.typing import NDArray
 from prepared import RESOLUTION, counts
 from tables import grouped, markdown
@@ -57,9 +65,7 @@ class Beams:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, ["stillmap"])
     add_run_arguments(p, [POPULATED, STOPS, "street-oncoming", "corridor-40-once"])
     args = p.parse_args()

@@ -64,6 +64,12 @@ def in_fresh_process(work: Callable[..., Outcome], *args: object) -> Outcome:
         return pool.apply(work, args)
 
 
+def make_parser(doc: str | None) -> argparse.ArgumentParser:
+    """A parser whose help is the docstring of a script."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(description=doc, formatter_class=formatter)
+
+
 def add_arguments(p: argparse.ArgumentParser, methods: Iterable[str]) -> None:
     """What to run and how, the same for all benchmarks of estimators; no methods: no choice."""
     if methods := list(methods):
@@ -97,15 +103,13 @@ def rows_of(
         cases: of these names or groups, if the command line names none.
         scored: of one run; a function of a module, as other processes call it.
     """
-    p = argparse.ArgumentParser(
-        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(doc)
     add_run_arguments(p, cases)
     add_arguments(p, [])
     args = p.parse_args()
     options_of("stillmap", args.set)  # refuses before hours have passed
     runs = runs_of(args, ["stillmap"])
-    done = sorted(outcomes(scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
+    done = outcomes_in_order(scored, runs, args.processes)
     return [{"case": run.case.name, **scores} for run, scores in done]
 
 
@@ -236,6 +240,13 @@ def outcomes(
             _tell(f"{done}/{len(jobs)}, {time.perf_counter() - started:.0f} s")
             yield waiting[future], future.result()
     print(f"{len(jobs)} runs, {time.perf_counter() - started:.0f} s", file=sys.stderr)
+
+
+def outcomes_in_order(
+    work: Callable[[Job], Outcome], jobs: list[Job], processes: int
+) -> list[tuple[Job, Outcome]]:
+    """Each job with what came of it, in the order of the jobs."""
+    return sorted(outcomes(work, jobs, processes), key=lambda pair: jobs.index(pair[0]))
 
 
 def timed(command: Sequence[str], **how: Any) -> tuple[str, float]:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from cases import TRAJECTORY, Case, few_walls
-from common import add_arguments, add_seed_arguments, options_of, outcomes, seeds_of
+from common import add_arguments, add_seed_arguments, make_parser, options_of, outcomes, seeds_of
 from numpy.typing import NDArray
 from pairs import known_relations, name_of, timed_poses
 from poses import ABSOLUTE, RELATIONS, pose_scores
@@ -61,9 +61,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--worlds", nargs="*", choices=WORLDS, default=list(WORLDS))

@@ -9,7 +9,6 @@ where a tenth of the beams that reach it end in it, at the poses that were found
 counted like that at Karto's poses. Relations are those of poses.py, ghosts and walls of worlds.py.
 """
 
-import argparse
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +16,15 @@ from dataclasses import dataclass
 import karto
 import numpy as np
 from cases import Case, chosen
-from common import Scores, add_arguments, add_seed_arguments, options_of, outcomes, seeds_of
+from common import (
+    Scores,
+    add_arguments,
+    add_seed_arguments,
+    make_parser,
+    options_of,
+    outcomes_in_order,
+    seeds_of,
+)
 from numpy.typing import NDArray
 from poses import pose_scores
 from prepared import Prepared, grid_of, prepare
@@ -48,9 +55,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--cases", nargs="+", default=["corridor-40", "hall-60"])
@@ -59,7 +64,7 @@ def main() -> None:
     options_of("stillmap", args.set)  # refuses before hours have passed
     what = (args.karto_python, tuple(args.set))
     jobs = [Job(case, seed, *what) for case in chosen(args.cases) for seed in seeds_of(args)]
-    done = sorted(outcomes(_rows, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(_rows, jobs, args.processes)
     print("Means over seeds, in brackets the worst.\n")
     print(table([row for _, rows in done for row in rows]))
 

@@ -11,7 +11,6 @@ left out. CPU time is that of all tasks; the speed-up counts from the fleet of o
 are what else the machine was busy with meanwhile, in cores on average (Linux).
 """
 
-import argparse
 import json
 import math
 import os
@@ -27,6 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from common import make_parser
 from distributed import LocalCluster
 from tables import markdown
 
@@ -42,9 +42,7 @@ class Cluster(NamedTuple):
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--recordings", type=int, default=12)
     p.add_argument("--scans", type=int, default=600)
     p.add_argument("--seed", type=int, default=100)

@@ -12,7 +12,6 @@ least 20 hits and half of all hits end on what stands still. Worse than odometry
 times that of odometry alone.
 """
 
-import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,16 @@ from typing import Any
 
 import numpy as np
 from cases import Case, scaled_odometry
-from common import Scores, add_arguments, add_seed_arguments, built, options_of, outcomes, seeds_of
+from common import (
+    Scores,
+    add_arguments,
+    add_seed_arguments,
+    built,
+    make_parser,
+    options_of,
+    outcomes_in_order,
+    seeds_of,
+)
 from poses import Variant, loop_scores, rows_by_variant
 from tables import Row, grouped, markdown
 
@@ -73,9 +81,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--kinds", nargs="+", choices=("drawn", "carried"), default=["drawn"])
@@ -89,7 +95,7 @@ def main() -> None:
         for seed in seeds_of(args)
         for case, about in drawn_worlds(kind, seed, args.worlds_per_seed)
     ]
-    done = sorted(outcomes(rows_of, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(rows_of, jobs, args.processes)
     print(report([row for _, rows in done for row in rows]))
 
 

@@ -13,7 +13,6 @@ out. A scan is taken when the odometry moved 0.5 m or 0.5 rad since the last one
 README and its ROS node have it; the others are carried by odometry from there.
 """
 
-import argparse
 import os
 import subprocess
 import tempfile
@@ -21,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import timed
+from common import make_parser, timed
 from numpy.typing import NDArray
 
 import stillmap
@@ -65,9 +64,7 @@ class Mapped:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("recording", type=Path)
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")

@@ -29,6 +29,7 @@ from pathlib import Path
 
 import live_logs
 import numpy as np
+from common import make_parser
 from tables import markdown
 
 from stillmap import build, load
@@ -52,9 +53,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     commands = p.add_subparsers(required=True)
     logs = commands.add_parser("logs")
     logs.set_defaults(run=live_logs.map_logs)

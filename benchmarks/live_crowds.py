@@ -20,6 +20,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+from common import make_parser
 from live import build_known_map, normalized_error
 from particle_filter import ParticleFilter
 from tables import markdown
@@ -74,9 +75,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--data", type=Path, required=True, help="folder for maps")
     p.add_argument("--world", default="hall")
     p.add_argument("--people", nargs="+", type=int, default=[0, 30, 60, 120])

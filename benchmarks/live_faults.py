@@ -22,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from common import make_parser
 from live import build_known_map
 from tables import markdown
 
@@ -93,9 +94,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--data", type=Path, required=True, help="folder for maps")
     p.add_argument("--world", default="hall")
     p.add_argument("--runs", type=int, default=10)

@@ -7,10 +7,10 @@ those that have done so for a second; precision: of all movers that are told. A 
 nearest person within 0.5 m. "nobody": movers and scans with any in the same world without people.
 """
 
-import argparse
 import time
 
 import numpy as np
+from common import make_parser
 from tables import markdown
 
 from stillmap.core import se2
@@ -23,9 +23,7 @@ _REACH, _NEAR, _WALKING = 15.0, 0.5, 0.3  # m, m, m/s
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--worlds", nargs="+", default=["hall", "corridor"])
     p.add_argument("--seed", type=int, default=11)
     p.add_argument("--people", type=int, help="default: as many as the world has")

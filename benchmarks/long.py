@@ -9,7 +9,6 @@ length is mapped by a process of its own; its memory is the largest resident siz
 pages of files count. Steps are CPU ms per scan and iteration.
 """
 
-import argparse
 import dataclasses
 import json
 import math
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import in_fresh_process
+from common import in_fresh_process, make_parser
 from numpy.typing import NDArray
 from tables import markdown
 
@@ -39,9 +38,7 @@ _CHUNK = 1000  # scans that are simulated together
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--world", choices=SCENES, default="hall")
     p.add_argument("--scans", nargs="+", type=int, default=[5_000, 20_000, 80_000, 288_000])
     p.add_argument("--seed", type=int, default=0)

@@ -7,13 +7,13 @@ its share that shows movers; shapes and textures of object models. The simulatio
 --within expects only what beams and images saw from at most M metres. Prints JSON.
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import model_readers
 import numpy as np
+from common import make_parser
 from model_objects import MoverScores, match_mover, score_object_models
 from model_readers import CameraSimulation
 from model_surface import score_surface, score_texture
@@ -30,9 +30,7 @@ Float = NDArray[np.float64]
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("result", type=Path, metavar="RESULT")
     p.add_argument("truth", type=Path, metavar="TRUTH")
     p.add_argument("--within", type=float, default=float("inf"), metavar="M")

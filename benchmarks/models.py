@@ -13,7 +13,6 @@ Movers: the share of those that were tracked of which there is a model, and of t
 anything else.
 """
 
-import argparse
 import math
 import subprocess
 import sys
@@ -24,7 +23,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Scores, add_arguments, add_seed_arguments, options_of, outcomes, seeds_of
+from common import (
+    Scores,
+    add_arguments,
+    add_seed_arguments,
+    make_parser,
+    options_of,
+    outcomes_in_order,
+    seeds_of,
+)
 from model_scores import score_model
 from tables import Column, means_and_worst
 
@@ -95,9 +102,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
@@ -110,7 +115,7 @@ def main() -> None:
         for world in args.worlds
         for seed in seeds_of(args)
     ]
-    done = sorted(outcomes(rows, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(rows, jobs, args.processes)
     print("Means over seeds, in brackets the worst.")
     print(means_and_worst([{"case": job.world, **row} for job, row in done], COLUMNS))
     for job, row in done:

@@ -9,7 +9,6 @@ maps it a third time without calibration. Factors are on the noise and errors of
 the error "none" nothing is wrong: "applied" counts what was calibrated nevertheless.
 """
 
-import argparse
 import dataclasses
 import functools
 import itertools
@@ -21,7 +20,15 @@ from unittest.mock import patch
 
 import numpy as np
 from cases import Case, chosen, scaled_odometry
-from common import Scores, add_seed_arguments, built, options_of, outcomes, seeds_of
+from common import (
+    Scores,
+    add_seed_arguments,
+    built,
+    make_parser,
+    options_of,
+    outcomes_in_order,
+    seeds_of,
+)
 from tables import Column, Row, grouped, markdown
 
 from stillmap.core.config import merge_nested
@@ -73,9 +80,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_seed_arguments(p)
     p.add_argument("--cases", nargs="+", default=list(CASES), help="names or groups")
     p.add_argument("--errors", nargs="+", choices=ERRORS, default=list(ERRORS))
@@ -90,7 +95,7 @@ def main() -> None:
             chosen(args.cases), args.errors, args.factors, seeds_of(args)
         )
     ]
-    done = sorted(outcomes(row_of, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(row_of, jobs, args.processes)
     print(report([row for _, row in done]))
 
 

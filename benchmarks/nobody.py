@@ -7,13 +7,12 @@ Without --topics: the topic that is chosen where none is given. Beams are all re
 counts them, hits those that ended somewhere. Poses are estimated.
 """
 
-import argparse
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import add_arguments, built, options_of, outcomes
+from common import add_arguments, built, make_parser, options_of, outcomes_in_order
 from tables import grouped, markdown
 
 from stillmap.io import read
@@ -45,9 +44,7 @@ class Found:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("bags", nargs="+", type=Path)
     p.add_argument("--topics", nargs="+", default=[None])
     add_arguments(p, ["stillmap"])
@@ -56,7 +53,7 @@ def main() -> None:
         Job(*words, tuple(args.set))
         for words in itertools.product(args.bags, args.topics, args.methods)
     ]
-    done = sorted(outcomes(found, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(found, jobs, args.processes)
     for method, some in grouped(done, lambda pair: pair[0].method).items():
         print(f"\n## {method}\n\n{table(some)}")
 

@@ -7,11 +7,10 @@ a cart or of a small robot), with one that it does not, and with the former stan
 the share of its returns that are left out; lost are returns of anything else.
 """
 
-import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import add_seed_arguments, seeds_of
+from common import add_seed_arguments, make_parser, seeds_of
 from tables import markdown
 
 from stillmap.prepare import self_filter
@@ -79,9 +78,7 @@ def row(case: str, seeds: list[int]) -> list[str]:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE")
     add_seed_arguments(p)
     p.set_defaults(n_seeds=3)

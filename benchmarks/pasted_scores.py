@@ -7,7 +7,6 @@ python benchmarks/pasted_scores.py OUT [--set section.key=value ...] [--keep DIR
 in the masks of people of their source images. Free is what some image shows without people.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 
 import model_surface
 import numpy as np
+from common import make_parser
 from model_readers import RECORD, read_record
 from model_surface import GREY, SAMPLES, TextureRecord, TrueImages, look_up_texture_source
 from numpy.typing import NDArray
@@ -139,9 +139,7 @@ def row(source: Path, result: Path, settings: Sequence[str]) -> dict[str, Any]:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("source", type=Path, help="what pasted.py wrote")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     p.add_argument("--keep", type=Path, metavar="DIR", help="leave the results there")

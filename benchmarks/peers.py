@@ -12,7 +12,6 @@ that of all M-steps, and what Karto takes for the scans; "process" is that of th
 stillmap's also labels the beams, iterates, draws maps and writes the report.
 """
 
-import argparse
 import itertools
 import json
 import statistics
@@ -24,7 +23,7 @@ from pathlib import Path
 
 import karto
 import numpy as np
-from common import timed
+from common import make_parser, timed
 from numpy.typing import NDArray
 from pairs import known_relations, name_of, timed_poses
 from real_logs import split
@@ -48,9 +47,7 @@ Method = Callable[[Path, Path], Found]  # of a recording and a folder for result
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("logs", type=Path, nargs="+", metavar="LOG")
     p.add_argument("--karto-python", metavar="PYTHON", help="an interpreter that has yag-slam")
     p.add_argument("--rounds", type=int, default=1)

@@ -9,13 +9,12 @@ and of the scans with marks in which half of them did; by default 9 of 10 scans 
 Objects counts those that any marked beam is with.
 """
 
-import argparse
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import add_arguments, built, options_of, outcomes
+from common import add_arguments, built, make_parser, options_of, outcomes
 from numpy.typing import NDArray
 from tables import grouped, markdown
 
@@ -50,9 +49,7 @@ class Found:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("folder", type=Path)
     add_arguments(p, ["stillmap"])
     args = p.parse_args()

@@ -5,13 +5,13 @@ python benchmarks/place_scores.py PLACE DAYS [--single RESULT ...]
 DAYS is a folder that `stillmap simulate --sessions` wrote.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from common import make_parser
 from numpy.typing import NDArray
 from place_cells import MIN_BEAMS, CellTruth, collect_cells, widen
 from place_changes import ChangeScores, read_changes, read_named_cells, score_changes
@@ -312,9 +312,7 @@ def _score_in_space(
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("place", type=Path, metavar="PLACE")
     p.add_argument("truth", type=Path, metavar="DAYS")
     p.add_argument("--single", type=Path, action="append", default=[], metavar="RESULT")

@@ -13,7 +13,6 @@ Every run has a process of its own, which reads what another one simulated: memo
 those of `stillmap.build` and of reading.
 """
 
-import argparse
 import contextlib
 import itertools
 import tempfile
@@ -32,8 +31,9 @@ from common import (
     add_seed_arguments,
     built,
     in_fresh_process,
+    make_parser,
     options_of,
-    outcomes,
+    outcomes_in_order,
     seeds_of,
 )
 from numpy.typing import NDArray
@@ -150,9 +150,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--cases", nargs="+", default=list(CASES), help="names or groups")
@@ -164,7 +162,7 @@ def main() -> None:
         options_of("stillmap", [*args.set, *variant.settings])  # refuses before hours have passed
     pairs = itertools.product(chosen(args.cases), seeds_of(args))
     jobs = [Job(*pair, some, tuple(args.set)) for pair in pairs]
-    done = sorted(outcomes(rows_of, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(rows_of, jobs, args.processes)
     print(report([row for _, rows in done for row in rows]))
 
 

@@ -7,7 +7,6 @@ Each seed draws a world, laser, crowd, resolution, estimator and odometry (`mixe
 rank correlation of each part with its scores, and the runs that are judged worst.
 """
 
-import argparse
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import mixed_sweeps
 import numpy as np
-from common import built, finite, outcomes, result_scores
+from common import built, finite, make_parser, outcomes, result_scores
 from mixed_runs import draw
 from numpy.typing import NDArray
 from prepared import prepare
@@ -31,9 +30,7 @@ _SHOWN = 12  # runs whose rank is furthest from that of the truth
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--seeds", type=int, nargs=2, default=(230, 293), metavar=("FIRST", "LAST"))
     p.add_argument("--lidar", action="store_true", help="runs in 3D")
     p.add_argument("--processes", type=int, default=2)

@@ -10,12 +10,19 @@ Beams on doors count in the last two columns only: one that is seen in one state
 every laser.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from common import Scores, add_arguments, add_seed_arguments, options_of, outcomes, seeds_of
+from common import (
+    Scores,
+    add_arguments,
+    add_seed_arguments,
+    make_parser,
+    options_of,
+    outcomes_in_order,
+    seeds_of,
+)
 from numpy.typing import NDArray
 from tables import Column, means_and_worst
 
@@ -59,9 +66,7 @@ class Job:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
@@ -69,7 +74,7 @@ def main() -> None:
     args = p.parse_args()
     options_of("stillmap", args.set)  # refuses before hours have passed
     jobs = [Job(world, seed, tuple(args.set)) for world in args.worlds for seed in seeds_of(args)]
-    done = sorted(outcomes(rows, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    done = outcomes_in_order(rows, jobs, args.processes)
     print("Means over worlds and seeds, in brackets the worst.")
     for way in WAYS:
         of_way = [{"case": job.world, **by_way[way]} for job, by_way in done]

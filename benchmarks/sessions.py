@@ -37,6 +37,7 @@ from pathlib import Path
 
 import numpy as np
 import session_merging as merging
+from common import make_parser
 from place_poses import FRAME_DT, PoseScores
 from place_scores import score_place
 from session_laps import write_cuts, write_laps, write_pieces
@@ -67,9 +68,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     commands = p.add_subparsers(required=True)
     for name, run in (
         ("alignment", align_pairs),

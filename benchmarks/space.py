@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Scores, add_seed_arguments, finite, in_fresh_process, seeds_of
+from common import Scores, add_seed_arguments, finite, in_fresh_process, make_parser, seeds_of
 from space_cases import WORLDS, Case, prepare, simulated
 from space_methods import CERTAIN, ESTIMATED, OURS, PEERS, of_ours, of_peer
 from space_scores import scores_of
@@ -71,9 +71,7 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--worlds", nargs="*", default=["street"], metavar="WORLD", help=f"{WORLDS}")
     p.add_argument("--lidar", nargs="+", type=int, default=[64], metavar="CHANNELS")
     p.add_argument("--columns", type=int, default=1875, help="azimuths per turn")

@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import session_merging as merging
+from common import make_parser
 from numpy.typing import NDArray
 from session_sets import STRETCHES, prepare_street
 from tables import markdown
@@ -72,9 +73,7 @@ class Mapped:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--data", type=Path, required=True, help="folder for sessions and results")
     p.add_argument("--streets", nargs="+", default=["street", "crossing"])
     p.add_argument("--seeds", type=int, default=3)

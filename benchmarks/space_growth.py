@@ -13,7 +13,6 @@ too. "m2 seen" are squares of a metre in which beams ended: memory may grow with
 sweep not at all.
 """
 
-import argparse
 import json
 import shutil
 import sys
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import in_fresh_process
+from common import in_fresh_process, make_parser
 from long import first_scans
 from numpy.typing import NDArray
 from tables import markdown
@@ -44,9 +43,7 @@ _WIDE = 1 << 20  # m: no simulated world is wider
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     p.add_argument("--world", choices=SCENES, default="drive")
     p.add_argument("--sweeps", nargs="+", type=int, default=[100, 1000, 5000])
     p.add_argument("--lidar", type=int, default=64, metavar="CHANNELS")

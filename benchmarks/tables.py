@@ -93,19 +93,10 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
     return out
 
 
-def per_case(rows: Sequence[Row], columns: Sequence[Column]) -> str:
-    """One line per case: mean over its seeds, the worst in brackets."""
-    columns = [column for column in columns if column.values(rows)]
-    lines = [
-        [name, *(column.mean_and_worst(of_case) for column in columns)]
-        for name, of_case in grouped(rows, lambda row: row["case"]).items()
-    ]
-    return markdown(["case", *(column.title for column in columns)], lines)
-
-
 def means_and_worst(rows: Iterable[Row], columns: Sequence[Column]) -> str:
     """A line for every case, and one for all of them: means, and in brackets the worst."""
     rows = list(rows)
+    columns = [column for column in columns if column.values(rows)]
     groups = {**grouped(rows, lambda row: str(row["case"])), "all": rows}
     lines = [
         [name, *(column.mean_and_worst(some) for column in columns)]

@@ -1,14 +1,13 @@
-"""Labels, maps and poses in simulated worlds against the truth and the wanted figures.
+"""Labels, maps and poses in simulated worlds against the truth.
 
 python benchmarks/worlds.py [--cases NAME|GROUP ...] [--methods stillmap paper ...]
     [--seeds tuning|reporting] [--n-seeds 5] [--true-poses] [--per-iteration]
     [--set section.key=value ...] [--processes 2] [--json ROWS] [--read ROWS ...] [--list]
 
 Scores are those of the result that a user gets; --per-iteration scores every iteration instead.
-Walls wanted are those of the same run without people; "in reach" those that it shows with true
+Walls are those of the same run without people; "in reach" those that it shows with true
 labels and true poses. What such a map of counts itself scores is "by true labels".
-The wanted figures are of people and vehicles: offices are held against them without the beams on
-their doors, and with every door a mover once more.
+Figures of offices are also given without the beams on doors.
 `--json` appends one row per run to a file as it ends, `--read` prints such files once more.
 """
 
@@ -27,6 +26,7 @@ from common import (
     built,
     finite,
     iteration_scores,
+    make_parser,
     options_of,
     outcomes,
     result_scores,
@@ -43,9 +43,8 @@ from tables import (
     Row,
     grouped,
     markdown,
-    per_case,
+    means_and_worst,
 )
-from wanted import against_wanted
 
 import stillmap
 
@@ -81,9 +80,7 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = make_parser(__doc__)
     add_arguments(p, ["stillmap"])
     add_seed_arguments(p)
     p.add_argument(
@@ -141,11 +138,11 @@ def _about(rows: Sequence[Row]) -> str:
 def _results(rows: Sequence[Row]) -> str:
     parts = ["Means over seeds, in brackets the worst."]
     for group, of_group in grouped(rows, lambda row: row["group"]).items():
-        parts += [f"### {group}", per_case(of_group, LABELS)]
+        parts += [f"### {group}", means_and_worst(of_group, LABELS)]
         if BY_KEY["recall_doors"].values(of_group) or BY_KEY["recall_vehicles"].values(of_group):
-            parts.append(per_case(of_group, MOVERS))
-        parts.append(per_case(of_group, (*MAP, *COST)))
-    return "\n\n".join([*parts, "### Against the wanted figures", against_wanted(rows)])
+            parts.append(means_and_worst(of_group, MOVERS))
+        parts.append(means_and_worst(of_group, (*MAP, *COST)))
+    return "\n\n".join(parts)
 
 
 def _per_iteration(rows: Sequence[Row]) -> str:

@@ -4,13 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cases import Case
 from change_scores import list_true_changes
-from changes import COLUMNS, _of_things, _scored, beams_of, scores_of, stays_of
-from common import Run
-from tables import means_and_worst
+from changes import COLUMNS, beams_of, scores_of, stays_of
 
-from stillmap.core.se2 import inverse, matrix
 from stillmap.sim import Simulation, scene_by_name, simulate
 
 SHORT = {"robot": {"scans": 1000}}
@@ -78,36 +74,3 @@ def test_what_is_right_scores_full_marks(street: Simulation) -> None:
     first = scores_of(perfect(street, "first"), street)
     assert (first["one_state"], first["right"]) == (scores["things"], 0)
     assert (first["new_kept"], first["old_occupied"]) == (0.0, 1.0)
-
-
-def test_doors_and_what_comes_and_goes_are_no_things() -> None:
-    hinge, width = (3.0, -1.0), 0.9
-    scene = SimpleNamespace(leaves=[SimpleNamespace(hinge=hinge, width=width)])
-    T_world_map = matrix(10.0, -5.0, np.pi / 2)
-
-    def change(kind: str, off: float) -> SimpleNamespace:
-        """So far from the hinge, in the frame of the map."""
-        x, y, _ = inverse(T_world_map) @ [hinge[0] + 0.6 * off, hinge[1] - 0.8 * off, 1.0]
-        return SimpleNamespace(kind=kind, x=float(x), y=float(y))
-
-    on_leaf = [change(kind, off) for kind in ("came", "left") for off in (0.0, 0.5, 1.09)]
-    apart = [change(kind, off) for kind in ("came", "left") for off in (1.11, 4.0)]
-    often = [change("comes and goes", off) for off in (0.5, 4.0)]
-    simulation = SimpleNamespace(scene=scene)
-    assert _of_things([*often, *on_leaf, *apart], simulation, T_world_map) == apart
-    assert _of_things(often, simulation, T_world_map) == []
-    scene.leaves = []
-    assert _of_things([*on_leaf, *apart], simulation, T_world_map) == [*on_leaf, *apart]
-
-
-@pytest.mark.slow
-def test_a_run_is_scored_and_shown() -> None:
-    case = Case("street", "moved", "street-moved", SHORT)
-    scores = _scored(Run(case, 0, "stillmap", ("em.max_iterations=1",), True))
-    assert 0.0 <= scores["old_occupied"] <= 1.0
-    assert scores["ate"] == pytest.approx(0.0, abs=1e-9)
-    text = means_and_worst(
-        [{"case": "a", **scores}, {"case": "b", **scores, "median_error": float("nan")}], COLUMNS
-    )
-    assert text.count("\n") == 4
-    assert "nan" not in text

@@ -76,27 +76,6 @@ def test_poses_are_of_the_base_and_scans_between_follow_odometry(
     assert 0.002 * found.taken <= found.cpu < found.process_cpu
 
 
-@pytest.mark.usefixtures("stand_in")
-def test_answers_are_those_before_later_scans_moved_earlier_ones(
-    recording: stillmap.Recording, tmp_path: Path
-) -> None:
-    graph = tmp_path / "yag_slam" / "graph_slam.py"
-    graph.write_text(f"""{STAND_IN["graph_slam"]}
-class GraphSlam(GraphSlam):
-    def process_scan(self, scan):
-        if self.scans == 3:
-            self.first.corrected_pose.x += 7
-        if self.scans == 0:
-            self.first = scan
-        return super().process_scan(scan)
-""")
-    found = karto.mapped(recording, sys.executable)
-    aside = se2.matrix(0.0, 10.0, 0.0)
-    np.testing.assert_allclose(found.answers, aside @ recording.T_odom_base, atol=1e-9)
-    assert found.poses[0, 0, 2] - found.answers[0, 0, 2] == pytest.approx(7.0)
-    np.testing.assert_allclose(found.poses[-1], found.answers[-1], atol=1e-9)
-
-
 def test_ranges_are_those_of_the_beams(recording: stillmap.Recording) -> None:
     first, step, ranges = karto.evenly(recording)
     angles = first + step * np.arange(90)

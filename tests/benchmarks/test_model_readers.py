@@ -6,7 +6,6 @@ import pytest
 from model_readers import read_glb
 
 from stillmap.mesh.texture import TexturedMesh
-from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
 
 pytest.importorskip("trimesh")
@@ -44,13 +43,3 @@ def test_colours_stay_where_they_are(tmp_path):
     # pages may be compressed
     assert np.abs(found.colored.color[:, 0] - 255 * u).mean() < 4.0
     assert np.abs(found.colored.color[:, 1] - 255 * v).mean() < 4.0
-
-
-def test_a_model_without_texture_has_no_colours(tmp_path):
-    square = np.array([(0.0, 0, 1), (2, 0, 1), (2, 1, 1), (0, 1, 1)])
-    faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
-    write_glb(tmp_path / "mesh.glb", Mesh(square, faces))
-    found = read_glb(tmp_path / "mesh.glb")
-    assert len(found.colored.points) == 0
-    assert np.allclose(found.vertices[:, 2], 1.0)
-    assert np.allclose(np.ptp(found.vertices, axis=0), (2.0, 1.0, 0.0))

@@ -12,7 +12,6 @@ from model_objects import (
 from model_surface import (
     GREY,
     NOTHING,
-    ColoredPoints,
     TextureRecord,
     TrueImages,
     distance_to_mesh,
@@ -20,12 +19,11 @@ from model_surface import (
     look_up_texture_source,
     sample_surface,
     score_surface,
-    score_texture,
 )
 from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
-from stillmap.sim.camera import SKY, compute_static_color
+from stillmap.sim.camera import SKY
 from stillmap.sim.geometry import BOX, Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
 
 Float = NDArray[np.float64]
@@ -131,23 +129,6 @@ def test_what_pictures_see_without_movers(z: float, turned: bool, off: float, sh
         record, sample_surface(vertices, record.faces, 20_000), _pictures(mask, off), T_WORLD_MAP
     )
     assert free.mean() == pytest.approx(share, abs=0.02)
-
-
-def test_texture_scores_of_a_half_painted_floor() -> None:
-    pytest.importorskip("skimage")
-    mask = np.zeros((30, 40), np.uint16)
-    mask[:, :10] = 5
-    record = _record(*_floor((-2, 2), (-1.5, 1.5)))
-    right = record.vertices[record.faces].mean(axis=1) @ T_WORLD_MAP[:3, :3].T + T_WORLD_MAP[:3, 3]
-    record.image[right[:, 0] < 0] = -1  # and with it all of the mover
-    places = np.column_stack([np.random.default_rng(2).uniform(-1, 1, (500, 2)), np.zeros(500)])
-    in_map = places @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3] + (0, 0, 0.02)
-    coloured = ColoredPoints(in_map, compute_static_color(places, 3))
-    found = score_texture(record, coloured, _pictures(mask), FLOOR, 3, T_WORLD_MAP)
-    assert found.textured == pytest.approx(0.5, abs=0.01)
-    assert found.mover == found.nothing == found.colour_median == found.colour_p95 == 0.0
-    assert found.in_view == pytest.approx(0.75, abs=0.01)
-    assert found.covered == pytest.approx(2 / 3, abs=0.01)
 
 
 # a box of 2 x 1 x 1 m that drives along x at 1 m/s

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 from object_scores import (
-    compute_rank_correlation,
     compute_true_flow_map,
     find_sightings,
     score_objects,
 )
 
-from stillmap.tracking import FlowMap, MovingObject
-from stillmap.tracking.flow_map import compute_flow_map
+from stillmap.tracking import MovingObject
 
 T, N = 40, 4  # scans at 5 Hz; beams of each
 OFFSET = np.arange(T + 1) * N
@@ -92,34 +90,6 @@ def test_false_objects_lie_on_what_is_static():
     walls = np.flatnonzero(walkers() == -1)
     found = scores(thing(beams_of(0)), thing(walls))
     assert (found.objects, found.false) == (2, 1)
-
-
-def test_speed():
-    found = scores(thing(beams_of(0), 1.3))
-    assert found.speed_error == pytest.approx(0.3)
-
-
-def squares(crossings, origin=(0.0, 0.0, 0.0)):
-    crossings = np.asarray(crossings, np.int32)
-    return FlowMap(crossings, crossings.astype(np.float32), origin, 1.0)
-
-
-def floor(width, height):
-    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
-
-
-def test_squares_are_compared_where_the_floor_is():
-    true = squares([[1, 2], [3, 4]])
-    assert compute_rank_correlation(true, true, floor(2, 2)) == pytest.approx(1.0)
-    assert compute_rank_correlation(squares([[4, 3], [2, 1]]), true, floor(2, 2)) == pytest.approx(
-        -1.0
-    )
-    moved = squares([[2], [4]], (1.0, 0.0, 0.0))  # its first column was never crossed
-    assert 0.5 < compute_rank_correlation(moved, true, floor(2, 2)) < 1.0
-    assert np.isnan(compute_rank_correlation(true, squares([[0, 0], [0, 0]]), floor(2, 2)))
-    assert np.isnan(compute_rank_correlation(true, true, floor(1, 1)))
-    with pytest.raises(ValueError, match="resolution"):
-        compute_rank_correlation(compute_flow_map([]), true, floor(2, 2))
 
 
 def test_true_crossings_lie_in_the_map():

@@ -6,7 +6,6 @@ from pairs import errors_of, known_relations, name_of, near_pairs, relations_bes
 
 from stillmap.core import se2
 from stillmap.results.eval.readers import read_relations
-from stillmap.sim import scene_by_name, simulate, write_simulation
 
 
 def line(T: int) -> np.ndarray:
@@ -25,14 +24,6 @@ def test_pairs_are_near_in_space_and_anywhere_in_time() -> None:
     assert np.mean(second - first > 10) == pytest.approx(0.5, abs=0.06)
     again = near_pairs(positions, np.random.default_rng(0), 3000, 5.0)
     np.testing.assert_array_equal((first, second), again)
-
-
-def test_a_scan_with_no_other_near_it_is_in_no_pair() -> None:
-    positions = np.array([[0.0, 0], [1, 0], [50, 0]])
-    first, second = near_pairs(positions, np.random.default_rng(0), 50)
-    assert 0 < len(first) < 50
-    assert {*first, *second} == {0, 1}
-    assert len(near_pairs(positions[1:], np.random.default_rng(0), 50)[0]) == 0
 
 
 def test_errors_are_those_of_the_displacements() -> None:
@@ -61,15 +52,3 @@ def test_relations_of_a_log_lie_beside_it(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "floor.3.relations", rows)
     assert relations_beside(log).name == "floor.3.relations"
     np.testing.assert_array_equal(read_relations(relations_beside(log)), found)
-
-
-def test_relations_of_a_simulation_are_true(tmp_path: Path) -> None:
-    sim = simulate(scene_by_name("hall-empty", {"robot": {"scans": 30}}), 0)
-    write_simulation(sim, tmp_path / "hall")
-    relations = known_relations(tmp_path / "hall", sim.recording.stamp_ns)
-    assert len(relations) == 1000
-    times = (sim.recording.stamp_ns / 1e9).tolist()
-    k, row = 17, relations[17]
-    first, second = (int(np.argmin(np.abs(np.array(times) - row[c]))) for c in (0, 1))
-    T = se2.inverse(sim.truth.T_world_base[first]) @ sim.truth.T_world_base[second]
-    np.testing.assert_allclose(relations[k, [2, 3, 7]], se2.parameters(T), atol=1e-9)

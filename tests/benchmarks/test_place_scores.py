@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_up_place import write_place
-from place_cells import CELL, Lattice, collect_cells, count_beams
+from place_cells import collect_cells
 from place_changes import ChangeScores
 from place_scores import PlaceScores, score_place
 from place_truth import SessionTruth, load_session_truth
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.io.stillmap_folder import read
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import plan_sessions, write_sessions
 
@@ -185,15 +184,3 @@ def test_damaged_places_are_refused(place, truth, file, text, error) -> None:
     (place / file).write_text(text)
     with pytest.raises(InputError, match=error):
         score_place(place, truth.folder)
-
-
-def test_cells_that_beams_pass_and_hit(truth: SessionTruth) -> None:
-    recording = read(truth.folder / "session-1")
-    beams = truth.beams(0)
-    lattice = Lattice.around(beams.walls.reshape(-1, 2))
-    seen = count_beams(recording, beams.T_world_base, beams.static, lattice)
-    assert seen.hits.sum() == beams.static.sum()
-    at = lattice.cells(beams.T_world_base[:, :2, 2])
-    assert (seen.passes.ravel()[at] > 0).mean() > 0.9
-    ranges = np.linalg.norm(recording.points[recording.hit], axis=1)
-    assert seen.passes.sum() == pytest.approx((ranges / CELL - 1.5).sum(), rel=0.02)

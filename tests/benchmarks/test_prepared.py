@@ -61,17 +61,6 @@ def test_what_ended_on_doors_and_things_is_left_out_of_the_scores_without_them(
     assert scored[1]["ece_unsure_no_doors"] == scored[1]["ece_unsure"] == pytest.approx(0.9)
 
 
-@pytest.mark.slow
-def test_things_are_where_they_were_without_people(moved: Prepared) -> None:
-    sim = moved.simulation
-    thing = np.array([*sim.truth.scene["mover_kinds"], "none"])[sim.truth.mover] == "thing"
-    points, hit, static = without_people(sim, np.random.default_rng(0))
-    both = thing & hit
-    off = np.hypot(*(points - sim.recording.points).T)[both]
-    assert np.mean(off < 10 * sim.scene.laser.range_noise) > 0.99
-    assert np.mean(static[both]) < 0.01
-
-
 def test_without_people_only_what_they_hid_differs(run: Prepared) -> None:
     sim = run.simulation
     points, hit, static = without_people(sim, np.random.default_rng(0))
