@@ -1,10 +1,12 @@
 """The drive through a town: a car that accelerates, waits at a light and slows down to turn."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import Light, RobotOptions
+from stillmap.sim import Light, RobotOptions, Simulation
 from stillmap.sim.vehicles import SpeedProfile
 
 Float = NDArray[np.float64]
@@ -77,3 +79,52 @@ def test_a_light_is_red_again_after_a_cycle() -> None:
     assert [over_the_end.is_red(t) for t in (0, 9.9, 10, 29.9, 30)] == [
         True, True, False, False, True,
     ]  # fmt: skip
+
+
+@pytest.fixture
+def drive(run: Callable[[str], Simulation]) -> Simulation:
+    """The whole route at 10 Hz."""
+    return run("drive")
+
+
+@pytest.mark.slow
+def test_it_waits_at_the_light_until_it_is_green(drive: Simulation) -> None:
+    xy = drive.truth.T_world_base[:, :2, 2]
+    speed = np.hypot(*np.diff(xy, axis=0).T) * 10
+    assert 15.5 < speed.max() < 15.6 + 1e-6
+    (light,) = drive.scene.lights
+    stands = np.flatnonzero(speed < 0.02)[1:]
+    assert np.hypot(*(xy[stands[:-1]] - light.at).T).max() < 0.6
+    assert light.red[0] < stands[0] / 10 < light.red[1] - 8.0
+    assert light.red[1] - 0.2 < stands[-1] / 10 < light.red[1] + 0.5
+    assert np.all(np.diff(stands) == 1)
+
+
+@pytest.mark.slow
+def test_cars_do_not_run_red_lights(drive: Simulation) -> None:
+    """No car crosses a stop line while it is red, but those too fast to stop."""
+    at = drive.truth.movers[..., :2]
+    lights = [(lane, light) for lane in drive.scene.lanes for light in lane.lights]
+    crossings = 0
+    for lane, light in lights:
+        along = np.array(lane.path[1]) - lane.path[0]
+        along = along / np.hypot(*along)
+        ahead, aside = (at - light.at) @ along, (at - light.at) @ [-along[1], along[0]]
+        near = (np.abs(aside) < 0.2) & (np.abs(ahead) < 20)
+        crosses = near[:-1] & near[1:] & (ahead[:-1] < 0) & (ahead[1:] >= 0)
+        late = (np.nonzero(crosses)[0] / 10 - light.red[0]) % light.cycle
+        assert np.all((late > light.red[1] - light.red[0]) | (late < 3.0))
+        crossings += len(late)
+    assert crossings > 3
+
+
+@pytest.mark.slow
+def test_the_queue_at_the_corner_stands_while_it_is_seen(drive: Simulation) -> None:
+    truth = drive.truth
+    scan = np.repeat(np.arange(drive.recording.n_scans), np.diff(drive.recording.offset))
+    for car in range(-drive.scene.lanes[-1].waiting, 0):
+        hits = scan[truth.mover == truth.movers.shape[1] + car]
+        assert len(hits) > 50
+        moved = np.abs(truth.movers[:, car] - truth.movers[0, car]).max(axis=1) > 1e-9
+        assert not moved[hits].any()
+        assert moved[-1]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.sim import SCENES, Simulation, scene_by_name, simulate
+from stillmap.sim.dynamics import place_faces
 
 Float = NDArray[np.float64]
 Distance = Callable[[Float, Float], Float]
@@ -114,3 +116,36 @@ def test_the_robot_meets_nobody(world: Simulation) -> None:
     least = {"person": radius + 0.25, "door": 0.0, "car": radius + 0.9, "forklift": radius + 0.6}
     for k, name in enumerate(kind.tolist()):
         assert off[:, k].min() > least[name], name
+
+
+@pytest.mark.slow
+def test_rounds_lead_through_every_corridor_and_home() -> None:
+    run = simulate(scene_by_name("rounds-empty", {"laser": {"beams": 8}}), 1)
+    xy = run.truth.T_world_base[:, :2, 2]
+    X, Y = (1.4, 48.2, 113.0, 195.8), (1.4, 34.2, 81.0)  # m, the corridors' middles
+    middles = [((a + b) / 2, y) for a, b in pairwise(X) for y in Y]
+    middles += [(x, (a + b) / 2) for a, b in pairwise(Y) for x in X]
+    for middle in middles:
+        assert np.hypot(*(xy - middle).T).min() < 0.3, middle
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    home = along[(np.hypot(*(xy - xy[0]).T) < 0.3) & (along > 10.0)]
+    # the first loop is closed after one round of it
+    assert home[0] == pytest.approx(2 * (X[1] - X[0] + Y[1] - Y[0]), abs=5.0)
+    assert 1200.0 < home[-1] < 1500.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["office-moved", "street-moved", "warehouse-moved"])
+def test_moved_things_are_seen_wherever_they_stay(name: str, wall_distance: Distance) -> None:
+    run = simulate(scene_by_name(name), 3)
+    seconds = 1e-9 * (run.recording.stamp_ns - run.recording.stamp_ns[0])
+    when = np.repeat(seconds, np.diff(run.recording.offset))
+    first = int(np.argmax(kinds(run) == "thing"))
+    for number, thing in enumerate(run.scene.things, start=first):
+        hits = when[run.truth.mover == number]
+        for stay in thing.stays:
+            end = np.inf if stay.until is None else stay.until
+            assert np.count_nonzero((hits >= stay.since) & (hits < end)) > 50
+            # and they stand in no wall
+            corners = place_faces(thing, stay)[:, :2]
+            assert wall_distance(corners, run.truth.walls).min() > 0.02
