@@ -27,6 +27,7 @@ from tables import markdown
 from stillmap.core import se2
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io import stillmap_folder
 from stillmap.sim import SCENES, episode, laser, planar, scene_by_name
 from stillmap.sim.dynamics import Motion, simulate_motion
@@ -79,7 +80,7 @@ def simulated(world: str, scans: int, seed: int, work: Path) -> Recording:
         T_base_sensor=se2.matrix(o.x, o.y, o.yaw)[None],
         sensor=np.zeros(scans, np.int32),
         T_odom_base=T_odom_base,
-        source={"format": "simulation", "scene": scene.name, "seed": seed},
+        source=Source(format="simulation", details={"scene": scene.name, "seed": seed}),
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.core.source import RangeRule, SensorNotes, Source
 from stillmap.io import writers
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow, select_time
@@ -15,7 +16,11 @@ START = 1_600_000_000  # s
 PERIOD = 0.1  # s between scans
 N = 16  # beams
 # noted, so that writers of parts state the angles and limits of the whole to the last digit
-_LASER = {"start_angle": -1.0, "angle_step": 2.0 / (N - 1), "ranges": {"threshold": 20.0}}
+_LASER = SensorNotes(
+    start_angle=-1.0,
+    angle_step=2.0 / (N - 1),
+    ranges=RangeRule(20.0, "", "unusable", "", None, "", 0.0),
+)
 
 
 def make_recording(
@@ -38,7 +43,7 @@ def make_recording(
         T_base_sensor=np.eye(dimension + 1)[None],
         sensor=np.zeros(scans, np.int32),
         T_odom_base=T if odometry else None,
-        source={"sensors": [_LASER]} if dimension == 2 else {},
+        source=Source(sensors=[_LASER] if dimension == 2 else []),
     )
 
 

@@ -11,6 +11,7 @@ from stillmap.cli.console import fail, print_lines, say
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError, printable
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io import stillmap_folder
 
 EVIL = "a\x1b[31mred\x07\x1b]0;title\x07\x9b2J\u202eb\nc\r"
@@ -46,7 +47,7 @@ def evil_recording(tmp_path: Path) -> Path:
         T_base_sensor=np.eye(3)[None],
         sensor=np.zeros(2, np.int32),
         T_odom_base=None,
-        source=source,
+        source=Source.from_dict(source),
     )
     stillmap_folder.write(recording, path)
     return path

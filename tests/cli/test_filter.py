@@ -187,7 +187,6 @@ def test_other_recording_is_refused(call, room, mapped, tmp_path):
             T_base_sensor=shorter.T_base_sensor,
             sensor=shorter.sensor[:10],
             T_odom_base=None,
-            source={},
         ),
         path,
     )

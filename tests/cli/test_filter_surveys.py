@@ -117,7 +117,7 @@ def test_formats_that_come_back_as_others(call, tmp_path, name, write, form):
         f"the format {form} is not written again: it comes back as a folder of PCD" in done.stderr
     )
     again, kept = read(tmp_path / "clean"), recording.hit & ~blank
-    assert again.source["format"] == "PCD"
+    assert again.source.format == "PCD"
     np.testing.assert_allclose(again.points[again.hit], recording.points[kept], atol=1e-6)
     if recording.T_recorded_base is not None:
         np.testing.assert_allclose(again.T_recorded_base, recording.T_recorded_base, atol=1e-9)

@@ -131,9 +131,9 @@ def test_recording_folder_gives_same_summary(path, tmp_path, capsys):
 )
 def test_notes_of_other_writers(path, tmp_path, capsys, source):
     recording = read(path)
-    recording.source.clear()
-    recording.source.update(source)
     write(recording, tmp_path / "rec")
+    header = tmp_path / "rec/recording.json"
+    header.write_text(json.dumps({**json.loads(header.read_text()), "source": source}))
     assert run(tmp_path / "rec") == 0
     assert "-90.00 to 45.00 deg" in capsys.readouterr().out
 

@@ -12,6 +12,7 @@ from maps import FILES, QUICK, list_files
 from refusals import refused
 
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes, Source
 from stillmap.io import read, write
 from stillmap.io.trajectory import read_tum
 
@@ -187,7 +188,7 @@ def test_depth_images_need_poses(call, tmp_path, nothing_left, stated):
         T_base_sensor=np.eye(4)[None],
         sensor=np.zeros(2, np.int32),
         T_odom_base=None,
-        source={"sensors": [{"name": "depth", "grid": [2, 2]}]},
+        source=Source(sensors=[SensorNotes("depth", grid=(2, 2))]),
         T_recorded_base=np.tile(np.eye(4), (2, 1, 1)) if stated else None,
     )
     write(recording, tmp_path / "depth")

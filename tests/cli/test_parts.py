@@ -31,8 +31,7 @@ def cut_folder(room, folder):
         window = TimeWindow(ReadOptions(start=seconds[first] or None, end=seconds[last]))
         path = folder / f"part_{number}"
         part = select_time(whole, window)
-        source = {key: value for key, value in part.source.items() if key != "part"}
-        writers.write(replace(part, source=source), path)
+        writers.write(replace(part, source=replace(part.source, part=None)), path)
         out.append(path)
     return [out[k] for k in (2, 0, 1)]
 

@@ -8,9 +8,11 @@ import pytest
 
 from stillmap.core import arrays
 from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.source import Source
 from stillmap.io import builder
-from stillmap.io.builder import ReadContext, RecordingBuilder
+from stillmap.io.builder import RecordingBuilder
 from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.prepare import prepare
 
 
 @pytest.fixture
@@ -70,10 +72,10 @@ def test_a_temporary_folder_that_is_gone(tmp_path):
 def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # noqa: ARG001
     monkeypatch.setattr(builder, "_BLOCK", block)
     scans = [rng.normal(size=(n, 3)).astype(np.float32) for n in (4, 0, 9)]
-    gathered = RecordingBuilder(3, ReadContext(ReadOptions(), scratch=tmp_path), beam_times=True)
+    gathered = RecordingBuilder(3, tmp_path, beam_times=True)
     for stamp, points in zip((30, 10, 20), scans, strict=True):
         gathered.add_scan(stamp, points, beam_time=np.full(len(points), stamp / 100.0))
-    found = gathered.build(np.eye(4)[None], source={})
+    found = gathered.build(np.eye(4)[None], source=Source())
     np.testing.assert_array_equal(found.stamp_ns, [10, 20, 30])
     np.testing.assert_array_equal(found.offset, [0, 0, 9, 13])
     np.testing.assert_array_equal(found.points, np.concatenate([scans[2], scans[0]]))
@@ -81,10 +83,11 @@ def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # no
 
 
 def test_ranges_of_clouds():
-    gathered = RecordingBuilder(2, ReadContext(ReadOptions(min_range=1.0, max_range=4.0)))
+    gathered = RecordingBuilder(2, None)
     x = [0.5, 2.0, 8.0, np.nan, np.inf, 0.0]
     gathered.add_scan(0, np.stack([x, np.zeros(6)], axis=1))
-    found = gathered.build(np.eye(3)[None], source={})
+    raw = gathered.build(np.eye(3)[None], source=Source())
+    found = prepare(raw, ReadOptions(min_range=1.0, max_range=4.0))
     np.testing.assert_array_equal(found.hit, [False, True, False, False, False, False])
     np.testing.assert_array_equal(found.points[:, 0], [np.nan, 2.0, 4.0, np.nan, np.nan, np.nan])
 

@@ -25,7 +25,6 @@ def recording_of(ranges, hit, seconds):
         T_base_sensor=se2.matrix([0.0], [0.0], [0.0]),
         sensor=np.zeros(T, np.int32),
         T_odom_base=None,
-        source={},
     )
 
 

@@ -55,7 +55,7 @@ def test_a_code_of_the_maximum_range_is_recognised():
     ranges[:, ::7] = 29.99
     recording = scans(ranges)
     assert not recording.hit.reshape(T, N)[:, ::7].any()
-    assert recording.source["sensors"][0]["ranges"]["threshold"] == 29.99
+    assert recording.source.sensors[0].ranges.threshold == 29.99
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 from flat import OPTIONS, files_of
 
 import stillmap
+from stillmap.core.source import Source
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_saved_and_loaded(merged, flat_place, tmp_path):
 def test_recordings_and_results_themselves(flat_days, flat_place):
     """Their labels are those of the files, to the bit."""
     recording = stillmap.read(flat_days / "day1")
-    nowhere = stillmap.Recording(**{**vars(recording), "source": {}})
+    nowhere = stillmap.Recording(**{**vars(recording), "source": Source()})
     built = stillmap.build(flat_days / "day2", OPTIONS)
     for first, names in (
         (nowhere, ["session", "day2"]),

@@ -10,6 +10,7 @@ import pytest
 import stillmap
 from stillmap.cli.main import main
 from stillmap.core import se2
+from stillmap.core.source import Source
 from stillmap.io import write
 
 SHORT = 400  # characters of a `repr`
@@ -94,7 +95,7 @@ def test_a_saved_result_is_copied_whole(saved, tmp_path):
 
 
 def test_a_recording_from_arrays_is_named_when_loading(built, tmp_path):
-    nowhere = stillmap.Recording(**{**vars(built.recording), "source": {}})
+    nowhere = stillmap.Recording(**{**vars(built.recording), "source": Source()})
     stillmap.build(nowhere, {"threads": 1, "em.max_iterations": 1}, resolution=0.2).save(tmp_path)
     loaded = stillmap.load(tmp_path)
     assert len(loaded.p_static) == nowhere.n_beams

@@ -29,7 +29,7 @@ def test_axes_and_units(tmp_path):
     np.testing.assert_allclose(T[1, :3, :3] @ [1, 0, 0], [0, -1, 0], atol=1e-12)
     assert np.linalg.det(T[1]) == pytest.approx(1.0)
     assert found.stamp_ns.tolist() == [0, 10**9]
-    assert any("one second apart" in warning for warning in found.source["warnings"])
+    assert any("one second apart" in warning for warning in found.source.warnings)
 
 
 @pytest.mark.parametrize("heading", ["# x y z\n", "2 1\n", "\n", ""])
@@ -49,7 +49,7 @@ def test_a_pose_that_is_missing_costs_the_poses(tmp_path, pose):
     found = read(tmp_path)
     assert found.n_scans == 2
     assert found.T_recorded_base is None
-    assert any("1 scans have no pose" in warning for warning in found.source["warnings"])
+    assert any("1 scans have no pose" in warning for warning in found.source.warnings)
 
 
 def test_damage(tmp_path):
@@ -63,7 +63,7 @@ def test_damage(tmp_path):
     (tmp_path / "scan006.3d.gz").write_bytes(gzip.compress(b"1" * 3_000_000))
     found = read(tmp_path)
     assert found.n_scans == 1
-    skipped = {reason: damage["lines"] for reason, damage in found.source["skipped"].items()}
+    skipped = {reason: damage.lines for reason, damage in found.source.skipped.items()}
     assert skipped == {
         "is damaged": [2, 3, 7],
         "is empty": [4],
@@ -80,7 +80,7 @@ def test_codes_for_nothing_are_no_walls(tmp_path):
     write(tmp_path, 0, near + far)
     found = read(tmp_path)
     assert found.hit.sum() == 50
-    assert any("code" in warning for warning in found.source["warnings"])
+    assert any("code" in warning for warning in found.source.warnings)
     assert read(tmp_path, ReadOptions(max_range=100.0)).hit.all()
     write(tmp_path, 0, near + "0 0 3276.7\n" * 3)
     assert read(tmp_path).hit.all()

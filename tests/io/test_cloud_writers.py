@@ -26,7 +26,7 @@ def test_round_trip(space, tmp_path, write):
     found = read(tmp_path / "out")
     require_same(found, space)
     np.testing.assert_allclose(found.T_recorded_base, space.T_recorded_base, atol=1e-12)
-    assert found.source.get("skipped", {}) == {}
+    assert found.source.skipped == {}
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
@@ -148,12 +148,12 @@ def test_clouds_far_from_zero_keep_their_millimetres(space, tmp_path, module, en
     T[:, :3, 3] += [512_345.25, 5_401_234.75, 300.5]
     module.write(space, tmp_path / f"c.{ending}", T)
     found = read(tmp_path / f"c.{ending}")
-    origin = np.array(found.source["origin"])
+    origin = np.array(found.source.origin)
     assert np.all(origin == np.round(origin))
     placed = space.end_points(np.arange(space.n_beams), T)
     np.testing.assert_allclose(found.points + origin, placed, atol=2e-4)
     assert np.abs(found.points).max() < 200
-    assert any("the new origin" in warning for warning in found.source["warnings"])
+    assert any("the new origin" in warning for warning in found.source.warnings)
 
 
 def test_ranges_are_narrowed_while_reading(space, tmp_path):
@@ -165,6 +165,6 @@ def test_ranges_are_narrowed_while_reading(space, tmp_path):
     assert np.isnan(found.points[length < 10]).all()
     ends = np.linalg.norm(found.points[length >= 30], axis=1)
     np.testing.assert_allclose(ends, 30.0, rtol=1e-6)
-    assert found.source["read_options"] == {"min_range": 10.0, "max_range": 30.0}
+    assert found.source.read_options == {"min_range": 10.0, "max_range": 30.0}
     with pytest.raises(InputError, match="2D recordings only"):
         read(tmp_path / "out", ReadOptions(laser_x=0.1))

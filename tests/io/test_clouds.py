@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stillmap.core.errors import InputError
+from stillmap.core.source import Skipped
 from stillmap.io import read
 from stillmap.io.point_cloud import las
 
@@ -36,7 +37,7 @@ def test_ply(tmp_path, kind):
     found = read(ply(tmp_path / "a.ply", header, body, kind))
     np.testing.assert_array_equal(found.points, [[1, 2, 3], [4, 5, 6]])
     assert found.T_recorded_base is None
-    assert "beams start at the origin" in found.source["warnings"][0]
+    assert "beams start at the origin" in found.source.warnings[0]
 
 
 def test_a_folder_of_ply_shares_its_zero(tmp_path):
@@ -46,8 +47,8 @@ def test_a_folder_of_ply_shares_its_zero(tmp_path):
         ply(tmp_path / f"{i}.ply", VERTICES, rows.tobytes() if i != 1 else b"")
     found = read(tmp_path)
     assert found.n_scans == 2
-    assert found.source["skipped"] == {"is truncated": {"count": 1, "lines": [2]}}
-    assert found.source["skipped_unit"] == "file"
+    assert found.source.skipped == {"is truncated": Skipped(1, [2])}
+    assert found.source.skipped_unit == "file"
     np.testing.assert_allclose(found.points[2:] - found.points[:2], [[0, 0, 2]] * 2)
 
 
@@ -169,7 +170,7 @@ def test_e57(scanned):
     path.with_name("c.e57").write_bytes(path.read_bytes()[:5000])
     folder = read(path.parent)
     assert folder.n_scans == 4
-    assert folder.source["skipped"]["is damaged"]["lines"] == [5]
+    assert folder.source.skipped["is damaged"].lines == [5]
 
 
 def checksum(page):
@@ -202,7 +203,7 @@ def test_e57_with_another_description_is_read(scanned):
     found = read(path)
     assert found.n_scans == 2
     assert found.T_recorded_base is None
-    assert "no sensor pose is recorded" in found.source["warnings"][-1]
+    assert "no sensor pose is recorded" in found.source.warnings[-1]
 
 
 @pytest.mark.parametrize("count", [b"301", b"5000", b"9999999999999"])
@@ -212,9 +213,9 @@ def test_e57_that_promises_more(scanned, count):
     described(path, lambda xml: xml.replace(old, new, 1))
     found = read(path)
     assert found.n_scans == 1
-    ((reason, damage),) = found.source["skipped"].items()
+    ((reason, damage),) = found.source.skipped.items()
     assert reason in ("is truncated", "is damaged")
-    assert damage == {"count": 1, "lines": [1]}
+    assert damage == Skipped(1, [1])
 
 
 def test_e57_with_entities_is_refused(scanned):

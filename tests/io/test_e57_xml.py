@@ -88,9 +88,9 @@ def test_damaged_scans_are_given_up_on(write_e57, monkeypatch):
     monkeypatch.setattr(e57, "_MAX_DAMAGED", 5)
     recording = read(write_e57(repeat))
     assert recording.n_scans == 1
-    skipped = recording.source["skipped"]
-    assert skipped["holds too many damaged scans"]["count"] == 5
-    assert sum(one["count"] for one in skipped.values()) == 10
+    skipped = recording.source.skipped
+    assert skipped["holds too many damaged scans"].count == 5
+    assert sum(one.count for one in skipped.values()) == 10
 
 
 @pytest.mark.parametrize(("seconds", "is_stamp"), [("1e9", True), ("4.9e9", False), ("-1", False)])

@@ -63,7 +63,7 @@ def test_a_colour_camera_beside_is_found(tmp_path):
     found = read(write(tmp_path, BESIDE))
     (camera,) = found.images.cameras
     assert camera.K[0, 0] == pytest.approx(BESIDE[0], rel=0.02)
-    assert any("not registered to color" in warning for warning in found.source["warnings"])
+    assert any("not registered to color" in warning for warning in found.source.warnings)
     # what counts is where things are seen
     offset = (np.linalg.inv(T_BASE_CAMERA) @ camera.T_base_camera)[:3, 3]
     as_found = (camera.K[0, 0], camera.K[0, 2], camera.K[1, 2], *offset[:2])
@@ -80,7 +80,7 @@ def test_where_depth_is_laid_over_both_are_one(tmp_path):
     (camera,) = found.images.cameras
     assert camera.K[0, 0] == DEPTH[0]
     np.testing.assert_array_equal(camera.T_base_camera, T_BASE_CAMERA)
-    assert len(found.source["warnings"]) == 1  # no times
+    assert len(found.source.warnings) == 1  # no times
 
 
 def test_who_gives_cameras_knows(tmp_path):

@@ -34,7 +34,7 @@ def cloud(tmp_path):
 def test_a_cloud_is_converted_where_it_was(cloud, tmp_path):
     points, path = cloud
     recording = read(path)
-    assert recording.source["origin"]
+    assert recording.source.origin
     writers.write(recording, tmp_path / "out.ply")
     columns = list(ply.read_columns(ply.read_layout(tmp_path / "out.ply"), ("x", "y", "z")))
     found = np.stack(columns[0], axis=1)
@@ -74,14 +74,14 @@ def test_scans_without_a_pose_beside_others(tmp_path):
     ends = found.end_points(np.arange(found.n_beams), found.T_recorded_base)
     np.testing.assert_allclose(ends[:50], points + UTM, rtol=0, atol=1e-5)
     np.testing.assert_allclose(ends[50:], points + UTM + (3.0, 4.0, 0.0), rtol=0, atol=1e-5)
-    assert "origin" not in found.source
+    assert found.source.origin is None
 
 
 @pytest.mark.parametrize("number", ["1e9", "-3e300", "1e12"])
 def test_a_trajectory_a_million_kilometres_away(tmp_path, number):
     path = tmp_path / "poses.tum"
     path.write_text(f"1 0 0 0 0 0 0 1\n2 0 {number} 0 0 0 0 1\n")
-    with pytest.raises(InputError, match=r"poses\.tum:2: has a position a million kilometres away"):
+    with pytest.raises(InputError, match=r"poses\.tum:2: is no pose"):
         read_tum(path)
 
 

@@ -16,7 +16,6 @@ import pytest
 from stillmap.core.config import load_toml, override, parse_assignment
 from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder, text_lines, writers
-from stillmap.io.carmen import log as log_module
 from stillmap.io.trajectory import read_tum
 from stillmap.prepare.options import ReadOptions
 from stillmap.results import reader
@@ -69,15 +68,6 @@ def test_logs_that_pack_well_are_read(tmp_path):
     log = "".join(FLASER.replace(" 1 host", f" {t + rng.random():.6f} host") for t in range(30_000))
     (tmp_path / "a.log.gz").write_bytes(gzip.compress(log.encode()))
     assert read(tmp_path / "a.log.gz").n_scans == 30_000
-
-
-def test_log_without_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(log_module, "_MAX_UNKNOWN_LINES", 100)
-    (tmp_path / "a.log").write_text(FLASER + "other\n" * 300)
-    with pytest.raises(InputError, match="100 lines in a row that are no records"):
-        read(tmp_path / "a.log")
-    (tmp_path / "b.log").write_text((FLASER + "other\n" * 90) * 5)
-    assert read(tmp_path / "b.log").n_scans == 5
 
 
 @pytest.mark.parametrize("name", ["stamp_ns.npy", "points.npy", "T_odom_base.npy"])

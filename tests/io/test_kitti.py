@@ -46,7 +46,7 @@ def test_sweeps_and_times_are_enough(folder):
     assert found.T_recorded_base is None
     assert found.images is None
     assert found.beam_time is None
-    assert found.source["warnings"] == []
+    assert found.source.warnings == []
 
 
 def test_poses_of_the_camera_become_those_of_the_laser(folder):
@@ -85,7 +85,7 @@ def test_poses_that_cannot_be_used_cost_the_poses(folder, files, what):
     found = read(folder)
     assert found.T_recorded_base is None
     assert found.n_scans == 3
-    assert any(what in warning for warning in found.source["warnings"]), found.source["warnings"]
+    assert any(what in warning for warning in found.source.warnings), found.source.warnings
 
 
 def test_a_picture_that_wants_all_memory_is_damaged(folder, monkeypatch):
@@ -172,14 +172,14 @@ def test_damaged_sweeps_are_skipped_and_counted(folder):
     (folder / "times.txt").write_text("".join(f"{i}\n" for i in range(4)) + "x\n5\n6\n")
     found = read(folder)
     assert found.stamp_ns.tolist() == [0, 2 * 10**9, 5 * 10**9]
-    skipped = {reason: damage["lines"] for reason, damage in found.source["skipped"].items()}
+    skipped = {reason: damage.lines for reason, damage in found.source.skipped.items()}
     assert skipped == {
         "is truncated": [2],
         "is empty": [4],
         "has no stamp": [5, 8],
         "is no regular file": [7],
     }
-    assert "skipped 5 of 8: 000001.bin" in found.source["warnings"][-1]
+    assert "skipped 5 of 8: 000001.bin" in found.source.warnings[-1]
 
 
 def test_points_that_are_not_finite_or_absurd_are_unusable(folder):

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillmap.core.recording import Recording
+from stillmap.core.source import RangeRule, SensorNotes, Source
 from stillmap.io import laser_scan
 
 
@@ -26,7 +27,7 @@ def recording(scans, *, hit=None, sensors=(), sensor=None, beam_time=None):
         T_base_sensor=np.tile(np.eye(3), (sensor.max(initial=0) + 1, 1, 1)),
         sensor=sensor,
         T_odom_base=None,
-        source={"sensors": list(sensors)},
+        source=Source(sensors=list(sensors)),
         beam_time=None if beam_time is None else np.asarray(beam_time, np.float32),
     )
 
@@ -56,7 +57,7 @@ def test_angles_are_found_in_the_points(start, degrees, falling, n, seed):
 
 
 def test_what_the_reader_noted_comes_first():
-    angles, noted = np.linspace(-1.0, 1.0, 21), {"start_angle": -1.0, "angle_step": 0.1}
+    angles, noted = np.linspace(-1.0, 1.0, 21), SensorNotes(start_angle=-1.0, angle_step=0.1)
     one = recording([(angles, np.full(21, 5.0))], sensors=[noted])
     assert laser_scan.beam_angles(one).tolist() == [[-1.0, 0.1]]
 
@@ -75,10 +76,14 @@ def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
 
 
 def test_how_far_lasers_see():
-    noted = {"ranges": {"threshold": 81.91}}
+    rule = RangeRule(81.91, "", "unusable", "", None, "", 0.0)
+    noted = SensorNotes(ranges=rule)
     scans = [([0.0, 1.0], [3.0, 7.0]), ([0.0, 1.0], [4.0, 9.0]), ([0.0], [np.nan])]
     one = recording(
-        scans, hit=[True, False, True, True, False], sensor=[0, 1, 2], sensors=[{}, noted]
+        scans,
+        hit=[True, False, True, True, False],
+        sensor=[0, 1, 2],
+        sensors=[SensorNotes(), noted],
     )
     first, second, third = laser_scan.range_limits(one)
     assert first == (pytest.approx(3.0), pytest.approx(7.0))

@@ -10,8 +10,9 @@ from cut_recordings import PERIOD, START, N, cut, make_recording, write_parts
 from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
+from stillmap.core.source import SensorNotes, Source
 from stillmap.io import read, writers
-from stillmap.io.parts import join_recordings, read_parts
+from stillmap.io.reader import join_recordings, read_parts
 from stillmap.pipeline import inputs
 from stillmap.prepare.options import ReadOptions
 
@@ -54,11 +55,11 @@ def test_parts_in_any_order_are_the_whole(dimension, form, tmp_path):
     whole = read(write_whole(recording, tmp_path, form, ending))
     joined = inputs.read([paths[k] for k in (2, 0, 1)])
     require_equal(joined, whole)
-    noted = joined.source["parts"]
-    assert [part["path"] for part in noted] == paths
-    assert [part["scans"] for part in noted] == [20, 15, 25]
-    assert noted[1]["first_stamp_ns"] == START * 10**9 + 20 * int(1e9 * PERIOD)
-    assert joined.source["path"] == paths[0]
+    noted = joined.source.parts
+    assert [part.path for part in noted] == paths
+    assert [part.scans for part in noted] == [20, 15, 25]
+    assert noted[1].first_stamp_ns == START * 10**9 + 20 * int(1e9 * PERIOD)
+    assert joined.source.path == paths[0]
 
 
 @pytest.mark.slow
@@ -86,7 +87,7 @@ def test_lines_that_the_first_part_of_a_log_alone_has(tmp_path, drive):
     paths = [str(tmp_path / name) for name in ("b.log", "a.log")]
     joined = inputs.read(paths)
     require_equal(joined, read(tmp_path / "whole.log"))
-    assert joined.source["lines"] == len(rows) + 2
+    assert joined.source.details["lines"] == len(rows) + 2
     assert joined.T_base_sensor[0, 0, 2] == 0.25
 
 
@@ -96,8 +97,8 @@ def test_damage_in_a_later_part_is_counted_at_its_line(tmp_path, drive):
     before = len(first.splitlines())
     kind = second.splitlines()[-1].split()[0]
     Path(paths[1]).write_text(f"{kind} 3 1 2 broken\n{second}")
-    [damage] = inputs.read(paths).source["skipped"].values()
-    assert damage["lines"] == [before + 1]
+    [damage] = inputs.read(paths).source.skipped.values()
+    assert damage.lines == [before + 1]
 
 
 def test_an_unreadable_part_is_named(tmp_path, drive):
@@ -141,7 +142,7 @@ def test_recorded_poses_that_do_not_continue_are_left_out():
     )
     joined = join_recordings([posed[0], anew], ["a", "b"], None)
     assert joined.T_recorded_base is None
-    assert any("do not continue" in text for text in joined.source["warnings"])
+    assert any("do not continue" in text for text in joined.source.warnings)
 
 
 def test_a_raw_kitti_drive_in_pieces(tmp_path):
@@ -196,7 +197,7 @@ def breaks(whole):
         "it is 3D": cut(make_recording(3), 3.0, 5.9),
         "one of them has no odometry": second.without_odometry(),
         "its odometry begins 1.4": anew(second),
-        "it has other sensors": replace(second, source={"sensors": [{"name": "/front"}]}),
+        "it has other sensors": replace(second, source=Source(sensors=[SensorNotes("/front")])),
     }
 
 

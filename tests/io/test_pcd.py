@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stillmap.core.errors import InputError
+from stillmap.core.source import Skipped
 from stillmap.io import read
 from stillmap.io.point_cloud import pcd
 
@@ -90,7 +91,7 @@ def test_names_that_are_no_times(tmp_path, names):
     assert found.stamp_ns.tolist() == [0, 10**9, 2 * 10**9]
     if names[0] == "9":
         assert found.points[:, 0].tolist() == [1, 2, 3]
-    assert any("one second apart" in warning for warning in found.source["warnings"])
+    assert any("one second apart" in warning for warning in found.source.warnings)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +113,7 @@ def test_names_that_are_times(tmp_path, names, stamps):
         write(tmp_path / f"{name}.pcd", made([[1.0, 0, 0]]))
     found = read(tmp_path)
     assert found.stamp_ns.tolist() == stamps
-    assert found.source["warnings"] == []
+    assert found.source.warnings == []
 
 
 def pose(i):
@@ -138,7 +139,7 @@ def test_viewpoints_are_poses_wherever_the_points_are(tmp_path, in_world):
     found = read(tmp_path)
     np.testing.assert_allclose(found.T_recorded_base, [pose(i) for i in range(3)], atol=1e-12)
     np.testing.assert_allclose(found.points, np.concatenate(scans), atol=1e-5)
-    assert any("VIEWPOINT" in warning for warning in found.source["warnings"]) == in_world
+    assert any("VIEWPOINT" in warning for warning in found.source.warnings) == in_world
 
 
 @pytest.mark.parametrize("text", ["0 0 0 0 0 0 0", "1 2 3", "nan 0 0 1 0 0 0", "a b c d e f g"])
@@ -256,9 +257,9 @@ def test_headers_that_lie(tmp_path, what):
     assert "2.pcd" in str(caught.value)
     found = read(tmp_path)
     assert found.n_scans == 1
-    ((reason, damage),) = found.source["skipped"].items()
-    assert damage == {"count": 1, "lines": [2]}, reason
-    assert "2.pcd" in found.source["warnings"][-1]
+    ((reason, damage),) = found.source.skipped.items()
+    assert damage == Skipped(1, [2]), reason
+    assert "2.pcd" in found.source.warnings[-1]
 
 
 def test_a_scan_without_points_is_a_scan_in_a_folder(tmp_path):

@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes, Skipped
 from stillmap.io import read, rgbd
 from stillmap.io.rgbd import SCENES, T_BASE_CAMERA, TUM, detect_layout
+from stillmap.prepare import prepare
 from stillmap.prepare.options import ReadOptions
 
 READ = """
@@ -108,7 +110,7 @@ def assert_on_the_walls(recording: Recording, within: float) -> None:
 
 @pytest.fixture
 def no_alignment(monkeypatch):
-    monkeypatch.setattr(rgbd, "align_to_gravity", lambda recording: recording)
+    monkeypatch.setattr(prepare, "align_to_gravity", lambda recording: recording)
 
 
 @pytest.mark.usefixtures("no_alignment")
@@ -117,9 +119,9 @@ def test_every_depth_picture_is_a_grid_of_beams(scenes):
     assert (found.n_scans, found.dimension) == (8, 3)
     np.testing.assert_array_equal(np.diff(found.offset), W * H)
     np.testing.assert_array_equal(found.stamp_ns, np.round(8e9 / 30 * np.arange(8)))
-    assert found.source["sensors"] == [{"name": "depth", "grid": [H, W]}]
-    assert found.source["format"] == "7-Scenes"
-    assert "30 per second" in found.source["warnings"][0]
+    assert found.source.sensors == [SensorNotes("depth", grid=(H, W))]
+    assert found.source.format == "7-Scenes"
+    assert "30 per second" in found.source.warnings[0]
     # x ahead is the depth; the pixel in row 40, column 10 looks to the left, and down
     point = found.points.reshape(8, H, W, 3)[3, 40, 10]
     depth = depth_of(way(8)[3], 1000.0)[40, 10] / 1000.0
@@ -138,17 +140,17 @@ def test_unusable_pixels_keep_their_place(scenes):
     grid = found.points.reshape(8, H // 2, W // 2, 3)
     assert np.isnan(grid[0, 2, [3, 4]]).all()
     assert np.isfinite(grid[0]).sum() == 3 * (H * W // 4 - 2)
-    assert found.source["sensors"][0]["grid"] == [H // 2, W // 2]
+    assert found.source.sensors[0].grid == (H // 2, W // 2)
 
 
 def test_the_world_is_turned_so_that_z_is_up(scenes):
     found = read(scenes)
-    assert found.source["levelled"]["by"] == "plane"
+    assert found.source.details["levelled"]["by"] == "plane"
     assert_on_the_walls(found, 0.02)
     up = T_WORLD_ROOM[:3, 2]
-    np.testing.assert_allclose(found.source["levelled"]["up"], up, atol=2e-3)
+    np.testing.assert_allclose(found.source.details["levelled"]["up"], up, atol=2e-3)
     angle = np.degrees(np.arccos(up[2]))
-    assert found.source["levelled"]["turned_deg"] == pytest.approx(angle, abs=0.2)
+    assert found.source.details["levelled"]["turned_deg"] == pytest.approx(angle, abs=0.2)
 
 
 def test_without_level_surfaces_the_cameras_tell(tmp_path):
@@ -160,9 +162,11 @@ def test_without_level_surfaces_the_cameras_tell(tmp_path):
         depth = np.round(2000.0 / aside).astype(np.uint16)
         Image.fromarray(depth).save(folder / f"frame-{8 * k:06d}.depth.png")
     found = read(folder)
-    assert found.source["levelled"]["by"] == "cameras"
+    assert found.source.details["levelled"]["by"] == "cameras"
     # who looks down and around does not tilt on the whole
-    np.testing.assert_allclose(found.source["levelled"]["up"], T_WORLD_ROOM[:3, 2], atol=0.2)
+    np.testing.assert_allclose(
+        found.source.details["levelled"]["up"], T_WORLD_ROOM[:3, 2], atol=0.2
+    )
 
 
 def test_cameras_that_point_anywhere_tell_nothing(scenes):
@@ -172,7 +176,7 @@ def test_cameras_that_point_anywhere_tell_nothing(scenes):
         T[:3, :3] = R
         np.savetxt(scenes / f"frame-{8 * k:06d}.pose.txt", T)
     found = read(scenes)
-    assert "arbitrary orientations" in found.source["levelled"]["by"]
+    assert "arbitrary orientations" in found.source.details["levelled"]["by"]
     base = np.eye(4)
     np.testing.assert_allclose(
         found.T_recorded_base[0], base @ se2.inverse(T_BASE_CAMERA), atol=1e-12
@@ -195,7 +199,7 @@ def test_colour_of_another_size_is_not_calibrated(scenes):
         Image.fromarray(np.zeros((2 * H, 2 * W, 3), np.uint8)).save(file)
     found = read(scenes)
     assert found.images.cameras[0].K is None
-    assert any("calibration by read.cameras" in warning for warning in found.source["warnings"])
+    assert any("calibration by read.cameras" in warning for warning in found.source.warnings)
 
 
 @pytest.mark.parametrize("place", ["seq-01/camera.txt", "camera-intrinsics.txt", None])
@@ -206,7 +210,7 @@ def test_where_intrinsics_are_found(tmp_path, place):
     found = read(folder)
     expected = K if place else np.array([[585, 0, 320], [0, 585, 240], [0, 0, 1]])
     np.testing.assert_array_equal(found.images.cameras[0].K, expected)
-    said = any("no calibration of the depth camera" in w for w in found.source["warnings"])
+    said = any("no calibration of the depth camera" in w for w in found.source.warnings)
     assert said == (place is None)
 
 
@@ -214,7 +218,7 @@ def test_where_intrinsics_are_found(tmp_path, place):
 def test_intrinsics_that_are_none(scenes, text):
     (scenes / "camera-intrinsics.txt").write_text(text)
     found = read(scenes)
-    assert any("camera-intrinsics.txt is not used" in w for w in found.source["warnings"])
+    assert any("camera-intrinsics.txt is not used" in w for w in found.source.warnings)
     assert found.images.cameras[0].K[0, 0] == 585.0
 
 
@@ -242,9 +246,7 @@ def test_pictures_without_a_pose_are_skipped_where_most_have_one(scenes, text):
     (scenes / "frame-000008.pose.txt").write_text(text)
     (scenes / "frame-000024.pose.txt").unlink()
     found = read(scenes)
-    assert found.source["skipped"] == {
-        "has no pose, as most others have": {"count": 2, "lines": [2, 4]}
-    }
+    assert found.source.skipped == {"has no pose, as most others have": Skipped(2, [2, 4])}
     assert found.n_scans == len(found.T_recorded_base) == 6
 
 
@@ -254,7 +256,7 @@ def test_without_poses_all_pictures_are_scans(scenes):
     found = read(scenes)
     assert found.n_scans == 8
     assert found.T_recorded_base is None
-    assert "levelled" not in found.source
+    assert "levelled" not in found.source.details
 
 
 def test_damaged_pictures_are_skipped(scenes):
@@ -266,7 +268,7 @@ def test_damaged_pictures_are_skipped(scenes):
     (scenes / "frame-000032.depth.png").write_bytes(whole[: len(whole) // 2])
     found = read(scenes)
     assert found.n_scans == 3
-    reasons = set(found.source["skipped"])
+    reasons = set(found.source.skipped)
     assert {"holds no depth", "is of another size than the first", "is no image"} < reasons
     assert "is no depth image" in reasons
 
@@ -295,10 +297,10 @@ def test_a_camera_file_says_how_depth_is_seen(scenes, tmp_path):
     found = read(scenes, ReadOptions(depth_step=1, cameras=str(file)))
     np.testing.assert_array_equal(found.points.reshape(half.shape), half)
     said = "camera 'depth': its principal point, 31.5, 2350, lies outside images"
-    assert not any(said in text for text in found.source["warnings"])
+    assert not any(said in text for text in found.source.warnings)
     file.write_text(file.read_text().replace("cy = 23.5", "cy = 2350"))
     found = read(scenes, ReadOptions(cameras=str(file)))
-    assert any(said in text for text in found.source["warnings"])
+    assert any(said in text for text in found.source.warnings)
     file.write_text("[dept]\nfx = 3\n")
     with pytest.raises(InputError, match=r"no camera 'dept' \(nearest: 'depth'"):
         read(scenes, ReadOptions(cameras=str(file)))
@@ -320,7 +322,7 @@ def test_distortion_bends_the_grid(scenes, tmp_path):
 
 def test_tum(tmp_path):
     found = read(write_tum(tmp_path / "fr1"))
-    assert found.source["format"] == "TUM RGB-D"
+    assert found.source.format == "TUM RGB-D"
     assert found.stamp_ns[0] == 1305031102_160000000
     assert found.n_scans == 8
     assert_on_the_walls(found, 0.02)
@@ -343,11 +345,11 @@ def test_tum_poses_between_those_that_are_known(tmp_path):
     # far from any pose there is none
     (folder / "groundtruth.txt").write_text("\n".join(lines[:-5]))
     found = read(folder)
-    assert found.source["skipped"]["has no pose, as most others have"]["count"] == 3
+    assert found.source.skipped["has no pose, as most others have"].count == 3
     (folder / "groundtruth.txt").write_text("1 2 3\n")
     found = read(folder)
     assert found.T_recorded_base is None
-    assert any("poses are not used" in warning for warning in found.source["warnings"])
+    assert any("poses are not used" in warning for warning in found.source.warnings)
 
 
 def test_tum_lists_lead_nowhere_else(tmp_path):
@@ -358,7 +360,7 @@ def test_tum_lists_lead_nowhere_else(tmp_path):
     (folder / "depth.txt").write_text(text + "x depth/1.png\n1305031102.5 depth/1.png\n")
     found = read(folder)
     assert found.n_scans == 1
-    assert any("depth.txt: 6 lines" in warning for warning in found.source["warnings"])
+    assert any("depth.txt: 6 lines" in warning for warning in found.source.warnings)
     (folder / "depth.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match="lists no image"):
         read(folder)

@@ -21,16 +21,16 @@ LOGS = [
 @pytest.mark.parametrize(("name", "scans", "beams", "code", "backwards"), LOGS)
 def test_public_log(shared_data, name, scans, beams, code, backwards):
     recording = read(shared_data / "laser2d" / f"{name}.clf.gz")
-    skipped = recording.source["skipped"]
-    assert sum(damage["count"] for damage in skipped.values()) == backwards
+    skipped = recording.source.skipped
+    assert sum(damage.count for damage in skipped.values()) == backwards
     assert recording.n_scans == scans - backwards
     assert set(np.diff(recording.offset)) == {beams}
-    (sensor,) = recording.source["sensors"]
-    assert sensor["ranges"]["threshold"] == code
-    assert sensor["ranges"]["zero_means"] == "unusable"
+    (sensor,) = recording.source.sensors
+    assert sensor.ranges.threshold == code
+    assert sensor.ranges.zero_means == "unusable"
     length = np.linalg.norm(recording.points, axis=1)
     assert length[recording.hit].max() < code
-    assert 10.0 < sensor["ranges"]["free_range"] < code
+    assert 10.0 < sensor.ranges.free_range < code
     assert np.isfinite(recording.points).all()
     assert recording.T_odom_base is not None
 

@@ -63,9 +63,9 @@ def test_a_part_holds_the_scans_between_its_limits(dimension, form, tmp_path):
         np.testing.assert_array_equal(part.hit, whole.hit[beams])
         if whole.T_odom_base is not None:
             np.testing.assert_allclose(part.T_odom_base, whole.T_odom_base[rows], atol=1e-9)
-        noted = part.source["part"]
-        assert noted["omitted"] == T - part.n_scans
-        assert noted["last_stamp_ns"] - noted["first_stamp_ns"] == (T - 1) * PERIOD
+        noted = part.source.part
+        assert noted.omitted == T - part.n_scans
+        assert noted.last_stamp_ns - noted.first_stamp_ns == (T - 1) * PERIOD
 
 
 @pytest.mark.parametrize(("dimension", "form"), CASES)
@@ -93,7 +93,7 @@ def test_clouds_outside_are_not_opened(tmp_path):
     (path / "velodyne" / "000000.bin").write_bytes(b"no cloud")
     part = read(path, ReadOptions(start=1.0))
     assert part.n_scans == T - 10
-    assert part.source["skipped"] == {}
+    assert part.source.skipped == {}
 
 
 def test_a_second_sensor_may_begin_earlier(tmp_path):

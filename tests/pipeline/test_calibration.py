@@ -8,7 +8,7 @@ import pytest
 
 import stillmap
 from stillmap.core import config, se2
-from stillmap.pipeline import calibration
+from stillmap.core.source import Source
 from stillmap.pipeline.calibration import calibrate_recording
 from stillmap.prepare.lasers import mirror_beams
 from stillmap.sim import scene_by_name, simulate
@@ -30,7 +30,7 @@ def given(**options):
 
 
 def with_notes(recording, **notes):
-    source = {**recording.source, "sensors": [notes]}
+    source = Source.from_dict({"sensors": [notes]})
     return dataclasses.replace(recording, source=source)
 
 
@@ -64,13 +64,6 @@ def test_what_was_told_stays(simulation, notes, options):
     after, found, _ = calibrate_recording(recording, given(**options))
     assert np.array_equal(after.T_base_sensor[0, :2, :2], recording.T_base_sensor[0, :2, :2])
     assert "theta" not in found.lasers[0]
-
-
-def test_notes_of_other_programs(simulation):
-    for sensors in (None, [], [None], [{"extrinsics": 3}], {"a": 1}):
-        source = {**simulation.recording.source, "sensors": sensors}
-        recording = dataclasses.replace(simulation.recording, source=source)
-        assert calibration._given_parameters(recording, OPTIONS, 0) == set()
 
 
 @pytest.mark.slow

@@ -155,7 +155,7 @@ def test_clouds_in_a_map_projection(tmp_path):
     apart, _ = cKDTree(walls).query(points - UTM)
     assert len(points) == len(walls)
     assert apart.max() < 1e-3
-    np.testing.assert_allclose(result.poses[0][:3, 3], recording.source["origin"], atol=1e-9)
+    np.testing.assert_allclose(result.poses[0][:3, 3], recording.source.origin, atol=1e-9)
 
 
 def test_a_trajectory_that_was_written_is_read_again(room, tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
+from stillmap.core.source import RangeRule, SensorNotes
 from stillmap.prepare.plausibility import (
     leave_out_far_returns,
     mapped_range,
@@ -52,7 +53,9 @@ def test_mapped_range(dimension, cell, max_range, reach):
 )
 def test_what_is_said_of_the_laser_is_believed(how, stated):
     recording = scan([5.0], [True])
-    recording.source["sensors"] = [{"ranges": {"threshold": 250.0, "threshold_how": how}}]
+    recording.source.sensors = [
+        SensorNotes(ranges=RangeRule(250.0, how, "unusable", "", None, "", 0.0))
+    ]
     assert stated_max_range(recording) == stated
 
 

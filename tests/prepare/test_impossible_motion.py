@@ -24,7 +24,6 @@ def drive(dimension=2):
         sensor=np.zeros(T, np.int32),
         T_base_sensor=np.eye(dimension + 1)[None],
         T_odom_base=pose,
-        source={},
     )
 
 

@@ -68,7 +68,7 @@ def test_turns(direction, stamp, azimuth, turns):
 def test_recorded_times_are_kept(sweeps):
     found = add_beam_times(sweeps.recording, LEFT)
     assert found.beam_time is sweeps.recording.beam_time
-    assert any("times of their own" in text for text in found.source["warnings"])
+    assert any("times of their own" in text for text in found.source.warnings)
 
 
 def test_kitti_looks_ahead_at_the_stamp(tmp_path, timeless):

@@ -78,7 +78,7 @@ def test_the_room_is_seen_where_its_points_are(kitchen):
 
 
 def test_the_room_is_level(kitchen):
-    assert kitchen.source["levelled"]["by"] == "plane"
+    assert kitchen.source.details["levelled"]["by"] == "plane"
     hits = np.flatnonzero(kitchen.hit)[::50]
     height = kitchen.end_points(hits, kitchen.T_recorded_base)[:, 2]
     counts, edges = np.histogram(height, np.arange(-2.0, 0.6, 0.05))

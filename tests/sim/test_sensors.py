@@ -40,9 +40,9 @@ def test_whoever_knows_it_sees_the_same_place() -> None:
     upright, known = taken(), taken(upside_down="known")
     points = known.recording.points.reshape(60, -1, 2)[:, ::-1]
     np.testing.assert_allclose(points, upright.recording.points.reshape(60, -1, 2), atol=1e-5)
-    (sensor,) = known.recording.source["sensors"]
-    assert sensor["start_angle"] == pytest.approx(np.pi / 2)
-    assert sensor["angle_step"] == pytest.approx(-np.pi / 60)
+    (sensor,) = known.recording.source.sensors
+    assert sensor.start_angle == pytest.approx(np.pi / 2)
+    assert sensor.angle_step == pytest.approx(-np.pi / 60)
 
 
 @pytest.mark.parametrize("sweep_time", [0.0, 0.2])
@@ -54,7 +54,7 @@ def test_a_second_laser_looks_backwards_by_turns(sweep_time: float) -> None:
     place = se2.parameters(r.T_base_sensor)
     np.testing.assert_allclose(place[:, :2], [[0.08, 0], [-0.08, 0]], atol=1e-12)
     np.testing.assert_allclose(np.abs(place[:, 2]), [0, np.pi])
-    assert [s["name"] for s in r.source["sensors"]] == ["simulated laser", "simulated rear laser"]
+    assert [s.name for s in r.source.sensors] == ["simulated laser", "simulated rear laser"]
 
 
 def test_hits_of_both_lasers_lie_on_the_walls(

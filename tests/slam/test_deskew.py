@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.slam import SlamOptions, deskew_recording
 
 Float = NDArray[np.float64]
@@ -117,7 +118,7 @@ def test_nothing_else_changes():
     recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
     points = recording.points.copy()
     points[7] = np.nan
-    recording = replace(recording, points=points, T_odom_base=poses, source={"a": 1})
+    recording = replace(recording, points=points, T_odom_base=poses, source=Source("a"))
     before = points.copy()
     seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_array_equal(recording.points, before)

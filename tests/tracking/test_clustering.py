@@ -29,7 +29,6 @@ def recording(ranges, hit=None, stamps=None):
         T_base_sensor=se2.matrix(0.2, 0.0, 0.0)[None],
         sensor=np.zeros(T, np.int32),
         T_odom_base=None,
-        source={},
     )
 
 

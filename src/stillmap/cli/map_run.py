@@ -25,6 +25,7 @@ from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.prepare import interpret
 from stillmap.prepare.time_window import TimeWindow, select_time
 from stillmap.results.reader import read_run
 from stillmap.results.region import crop_result, require_overlap
@@ -80,7 +81,7 @@ def _read_tilting_laser(
         raise InputError(what, where=args.input[0])
     from stillmap.rig.build import check_rig  # only a rig needs it
 
-    paths = [part["path"] for part in planar.source.get("parts", ())] or args.input
+    paths = [part.path or "" for part in planar.source.parts] or args.input
 
     # the part to be mapped counts from the start of the planar recording, which has the topics
     read_as = dataclasses.replace(options, start=None, end=None, topic=None, tilting_topic=None)
@@ -88,15 +89,16 @@ def _read_tilting_laser(
         if topic is None:
             tilting = read(Path(path), read_as, progress=progress, scratch=scratch)
         else:
-            base_frame = planar.source.get("base_frame") or None
+            base_frame = planar.source.base_frame or None
             read_as = dataclasses.replace(read_as, topic=topic, base_frame=base_frame)
             tilting = _read_topic(paths, ReadContext(read_as, progress, scratch))
     where = path or paths[0]
-    if "part" in planar.source:
-        origin_ns = planar.source["part"]["first_stamp_ns"]
+    if planar.source.part is not None:
+        origin_ns = planar.source.part.first_stamp_ns
         tilting = select_time(tilting, TimeWindow(options, origin_ns), where)
     check_rig(planar, tilting, where)
-    return dataclasses.replace(tilting, source={**tilting.source, "path": where})
+    source = dataclasses.replace(tilting.source, path=where)
+    return dataclasses.replace(tilting, source=source)
 
 
 def _read_topic(paths: Sequence[str], context: ReadContext) -> Recording:
@@ -106,7 +108,8 @@ def _read_topic(paths: Sequence[str], context: ReadContext) -> Recording:
         if detect_format(Path(path)).name != "ROS bag":
             raise InputError("--tilting-topic is for bags", where=path)
     with np.errstate(over="ignore", invalid="ignore"):
-        return read_parts([Path(path) for path in paths], context, tilting=True)
+        raw = read_parts([Path(path) for path in paths], context, tilting=True)
+        return interpret(raw, context.options, context.scratch)
 
 
 def build_all(

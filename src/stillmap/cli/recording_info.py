@@ -1,13 +1,16 @@
 """Summary statistics of a recording, for `stillmap info`."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.json import to_jsonable
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes
 
 _MAX_SAMPLE = 1 << 24  # beams used for quantiles of ranges
 _MIN_SCANS = 100  # scans that a sample needs
@@ -15,14 +18,15 @@ _TABLES = ("skipped", "skipped_odometry", "damage", "records", "ignored", "param
 _LISTS = ("duplicates", "warnings", "topics", "self_filter")
 _WORDS = ("path", "format", "base_frame", "base_frame_how")
 _SENSOR_NOTES = (
-    *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
+    *("name", "beams_per_scan", "start_angle", "angle_step", "ranges"),
     *("upside_down", "upside_down_how", "frame"),
 )
 
 
 def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
-    notes = recording.source
+    source = recording.source
+    notes = to_jsonable(source.to_dict())
     return {
         "dimension": recording.dimension,
         "scans": recording.n_scans,
@@ -33,12 +37,12 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "time": _summarize_time(recording.stamp_ns),
         "part": notes.get("part") or {},
         "beam_times_s": _beam_time_range(recording.beam_time),
-        "spin": (notes.get("spin") or {}).get("direction"),
-        "odometry": _summarize_odometry(recording, notes.get("odometry") or {}),
+        "spin": None if source.spin is None else source.spin.direction,
+        "odometry": _summarize_odometry(recording, source.odometry),
         "recorded_poses": _summarize_path(recording.T_recorded_base),
         "images": _summarize_images(recording),
-        "sensors": _summarize_sensors(recording, notes.get("sensors") or []),
-        "skipped_unit": notes.get("skipped_unit") or "line",
+        "sensors": _summarize_sensors(recording),
+        "skipped_unit": source.skipped_unit,
         **{key: notes.get(key) or {} for key in _TABLES},
         **{key: notes.get(key) or [] for key in _LISTS},
         **{key: notes.get(key) for key in _WORDS},
@@ -170,40 +174,39 @@ def _summarize_images(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _summarize_sensors(recording: Recording, noted: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _summarize_sensors(recording: Recording) -> list[dict[str, Any]]:
     """Summaries of all sensors; a moving sensor has several extrinsics and one note."""
     out: list[dict[str, Any]] = []
-    first = 0
+    noted, first = recording.source.sensors, 0
     while first < len(recording.T_base_sensor):
-        notes = noted[len(out)] if len(out) < len(noted) else {}
-        stop = first + notes.get("places", 1)
+        notes = noted[len(out)] if len(out) < len(noted) else SensorNotes()
+        stop = first + max(notes.places, 1)
         out.append(_summarize_sensor(recording, range(first, stop), notes))
         first = stop
     return out
 
 
-def _summarize_sensor(
-    recording: Recording, numbers: range, noted: dict[str, Any]
-) -> dict[str, Any]:
+def _summarize_sensor(recording: Recording, numbers: range, noted: SensorNotes) -> dict[str, Any]:
     """Summarize one sensor from the notes of its reader, else from the arrays."""
     of_sensor = (recording.sensor >= numbers.start) & (recording.sensor < numbers.stop)
     scans = np.flatnonzero(of_sensor)
     out: dict[str, Any] = {"scans": len(scans)}
-    out.update((key, noted[key]) for key in _SENSOR_NOTES if key in noted)
+    known = {key: value for key, value in asdict(noted).items() if value is not None}
+    out.update((key, known[key]) for key in _SENSOR_NOTES if key in known)
     if recording.dimension == 2:
         x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[numbers.start]))
-        how = noted["extrinsics"].get("how", "") if "extrinsics" in noted else "as recorded"
+        how = "as recorded" if noted.extrinsics is None else noted.extrinsics.how
         out["extrinsics"] = {"x": x, "y": y, "theta_deg": float(np.degrees(theta)), "how": how}
-        out["field_of_view_deg"] = _field_of_view(recording, scans, out)
+        out["field_of_view_deg"] = _field_of_view(recording, scans, noted)
     return out
 
 
 def _field_of_view(
-    recording: Recording, scans: NDArray[np.intp], noted: dict[str, Any]
+    recording: Recording, scans: NDArray[np.intp], noted: SensorNotes
 ) -> list[float] | None:
     """First and last beam angle, degrees: as noted, else the extremes of all usable beams."""
-    first, step, n = (noted.get(k) for k in ("start_angle", "angle_step", "beams_per_scan"))
-    if isinstance(first, float) and isinstance(step, float) and isinstance(n, int):
+    first, step, n = noted.start_angle, noted.angle_step, noted.beams_per_scan
+    if first is not None and step is not None and n is not None:
         last = first + (n - 1) * step
         lowest, highest = sorted([first, last])  # a laser upside down turns clockwise
         return [float(np.degrees(lowest)), float(np.degrees(highest))]

@@ -48,12 +48,6 @@ def _reject_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is no number of JSON")
 
 
-def count_skipped(source: Mapping[str, Any]) -> int:
-    """Count of skipped records; `skipped` is `{reason: {"count", "lines"}}`."""
-    skipped: Mapping[str, Mapping[str, Any]] = source.get("skipped") or {}
-    return sum(int(one["count"]) for one in skipped.values())
-
-
 def to_jsonable(value: Any) -> Any:
     """Convert to types of JSON: arrays to lists, paths to text, NaN and infinity to None."""
     if isinstance(value, Mapping):

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core import arrays
 from stillmap.core.camera import Images
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.source import Source
 from stillmap.core.timestamps import MAX_BEAM_TIME, are_dated
-
-# signatures name ArrayLike instead of spelling it out
-
 
 _BLOCK = 1 << 14  # end points transformed at once
 
@@ -37,7 +35,7 @@ class Recording(ShortRepr):
         T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None: no odometry.
         beam_time: (M,) float32, seconds after the stamp of the scan, at most `MAX_BEAM_TIME`;
             None: all beams of a scan have its stamp.
-        source: JSON-able notes of the reader: input, format, sensors, warnings, skipped records.
+        source: notes of the reader: input, format, sensors, warnings, skipped records.
         T_recorded_base: (T, D+1, D+1) float64, poses stored in the recording, of a survey or other
             programs; used only on request. None: no poses.
         images: camera images; None: no images.
@@ -53,12 +51,16 @@ class Recording(ShortRepr):
     T_base_sensor: NDArray[np.float64]
     sensor: NDArray[np.int32]
     T_odom_base: NDArray[np.float64] | None
-    source: dict[str, Any] = field(default_factory=dict)
+    source: Source = field(default_factory=Source)
     beam_time: NDArray[np.float32] | None = None
     T_recorded_base: NDArray[np.float64] | None = None
     images: Images | None = None
     record: NDArray[np.int64] | None = None
     scratch: Path | None = None
+
+    # constructors from arrays, which `stillmap.io` sets: it knows what readings mean
+    from_scans: ClassVar[Callable[..., Recording]]
+    from_clouds: ClassVar[Callable[..., Recording]]
 
     def __post_init__(self) -> None:
         T, M, D = self.n_scans, self.n_beams, self.dimension
@@ -91,97 +93,6 @@ class Recording(ShortRepr):
             raise ValueError(f"offset: must not decrease, from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
             raise ValueError(f"sensor: indices must lie in [0, {S})")
-
-    @classmethod
-    def from_scans(
-        cls,
-        stamps: ArrayLike,
-        ranges: ArrayLike,
-        angles: ArrayLike,
-        odometry: ArrayLike | None = None,
-        *,
-        min_range: float = 0.0,
-        max_range: float | None = None,
-        sensor_pose: ArrayLike | None = None,
-        time_increment: float = 0.0,
-    ) -> Recording:
-        """A 2D recording from the arrays of a laser scanner.
-
-        Readings mean what they mean in a ROS LaserScan: NaN, negative and near zero: unusable;
-        +inf and readings from `max_range` on: nothing within reach, the beam shows free space.
-        As when a file is read, values that repeat at the top of the readings are recognised as
-        codes of the maximum range, and returns from the robot itself are removed.
-
-        Args:
-            stamps: (T,) not decreasing; floats are seconds, integers nanoseconds, or datetime64.
-            ranges: (T, N) metres, one row per scan.
-            angles: (N,) radians in the sensor frame, counter-clockwise, in any order.
-            odometry: (T, 3) x, y (m), theta (rad), or (T, 3, 3) T_odom_base; None: no odometry.
-            min_range: metres; shorter readings are unusable.
-            max_range: metres; readings from it on are maximum range; None: found in the readings.
-            sensor_pose: of the laser on the robot, (3,) x, y, theta or (3, 3); None: at the
-                robot's centre, unless the motion shows another place when the map is built.
-            time_increment: seconds from beam to beam; the stamp is that of the first beam.
-
-        Raises:
-            ValueError: names the argument, what was expected, and what it was.
-
-        Examples:
-            >>> recording = stillmap.Recording.from_scans(stamps, ranges, angles, odometry)
-            >>> result = stillmap.build(recording)
-        """
-        return _constructors["from_scans"](
-            stamps,
-            ranges,
-            angles,
-            odometry,
-            min_range=min_range,
-            max_range=max_range,
-            sensor_pose=sensor_pose,
-            time_increment=time_increment,
-        )
-
-    @classmethod
-    def from_clouds(
-        cls,
-        stamps: ArrayLike,
-        clouds: Iterable[ArrayLike],
-        odometry: ArrayLike | None = None,
-        *,
-        min_range: float = 0.0,
-        max_range: float | None = None,
-        sensor_pose: ArrayLike | None = None,
-        beam_times: Sequence[ArrayLike] | None = None,
-    ) -> Recording:
-        """A 3D recording from point clouds, one per sweep of a lidar.
-
-        Args:
-            stamps: (T,) not decreasing; floats are seconds, integers nanoseconds, or datetime64.
-            clouds: T arrays (N_t, 3) in the sensor frame, metres; a generator will do. Points that
-                are not finite, at the origin or implausibly far are unusable.
-            odometry: (T, 4, 4) T_odom_base; None: no odometry.
-            min_range: metres; nearer points are unusable.
-            max_range: metres; points from it on are maximum range; None: every point is a hit.
-            sensor_pose: (4, 4) of the lidar on the robot; None: at the robot's centre.
-            beam_times: T arrays (N_t,) of seconds after the stamp; None: all points of a cloud
-                have its stamp.
-
-        Raises:
-            ValueError: names the argument, what was expected, and what it was.
-
-        Examples:
-            >>> sweeps = (numpy.load(file) for file in files)
-            >>> recording = stillmap.Recording.from_clouds(stamps, sweeps)
-        """
-        return _constructors["from_clouds"](
-            stamps,
-            clouds,
-            odometry,
-            min_range=min_range,
-            max_range=max_range,
-            sensor_pose=sensor_pose,
-            beam_times=beam_times,
-        )
 
     def __repr__(self) -> str:
         seconds = float(self.stamp_ns[-1] - self.stamp_ns[0]) * 1e-9 if self.n_scans else 0.0
@@ -252,20 +163,25 @@ class Recording(ShortRepr):
             self.release_pages()
         return ends
 
+    def slice_scans(self, first: int, end: int) -> Recording:
+        """Scans first:end, as views of the arrays, and all images."""
+        rows, beams = slice(first, end), slice(int(self.offset[first]), int(self.offset[end]))
+        of_scans = ("T_odom_base", "T_recorded_base", "record")
+        given = {name: array for name in of_scans if (array := getattr(self, name)) is not None}
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns[rows],
+            offset=self.offset[first : end + 1] - self.offset[first],
+            points=self.points[beams],
+            hit=self.hit[beams],
+            sensor=self.sensor[rows],
+            beam_time=None if self.beam_time is None else self.beam_time[beams],
+            **{name: array[rows] for name, array in given.items()},
+        )
+
     def without_odometry(self) -> Recording:
         """The recording without odometry."""
         return replace(self, T_odom_base=None)
-
-
-# a constructor belongs to its class, what readings mean to rooms above: they enter themselves
-_constructors: dict[str, Callable[..., Recording]] = {}
-
-
-def register_constructors(
-    from_scans: Callable[..., Recording], from_clouds: Callable[..., Recording]
-) -> None:
-    """Enter what `Recording.from_scans` and `from_clouds` call; `stillmap.io` does."""
-    _constructors.update(from_scans=from_scans, from_clouds=from_clouds)
 
 
 def _check(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: type) -> None:

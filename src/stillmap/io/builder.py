@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder, empty
+from stillmap.core.arrays import ArrayBuilder, empty, squared_lengths
 from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
+from stillmap.core.source import Skipped, Source
 from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.prepare.options import MAX_POINT_DISTANCE, ReadOptions
@@ -52,13 +53,12 @@ class RecordingBuilder:
 
     Args:
         dimension: D, 2 or 3.
-        context: points nearer than the option `min_range` are unusable, those from `max_range` on
-            are at maximum range; its scratch folder holds the buffers.
+        scratch: folder of the buffers; None: the system's temporary folder.
         beam_times: whether scans have beam times.
     """
 
-    def __init__(self, dimension: int, context: ReadContext, *, beam_times: bool = False) -> None:
-        self._options, self._folder = context.options, context.scratch
+    def __init__(self, dimension: int, scratch: Path | None, *, beam_times: bool = False) -> None:
+        self._folder = scratch
         self.stamp_ns, self.length, self.sensor = array("q"), array("q"), array("i")
         self._points = ArrayBuilder(np.float32, (dimension,), self._folder)
         self._hit = ArrayBuilder(np.bool_, (), self._folder)
@@ -86,9 +86,13 @@ class RecordingBuilder:
         """
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
-            known, hit = _apply_range_limits(np.asarray(points[block], np.float32), self._options)
+            known = np.asarray(points[block], np.float32)
+            length = np.sqrt(squared_lengths(known))
+            usable = (length <= MAX_POINT_DISTANCE) & (length > 0.0)
+            if not usable.all():
+                known = np.where(usable[:, None], known, np.float32(np.nan))
             self._points.append(known)
-            self._hit.append(hit)
+            self._hit.append(usable)
             if self._times is not None:
                 times = np.zeros(len(known)) if beam_time is None else beam_time[block]
                 self._times.append(np.where(np.abs(times) <= MAX_BEAM_TIME, times, 0.0))
@@ -100,7 +104,7 @@ class RecordingBuilder:
         self,
         T_base_sensor: NDArray[np.float64],
         *,
-        source: dict[str, Any],
+        source: Source,
         T_odom_base: NDArray[np.float64] | None = None,
         T_recorded_base: NDArray[np.float64] | None = None,
         record: NDArray[np.int64] | None = None,
@@ -139,24 +143,6 @@ class RecordingBuilder:
             record=None if record is None else record[order],
             **more,
         )
-
-
-def _apply_range_limits(
-    points: NDArray[np.float32], options: ReadOptions
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Points (n, D), NaN where unusable, and hits (n,)."""
-    # column by column: NumPy is slow along rows of two or three numbers
-    length = np.sqrt(sum(column * column for column in points.T.astype(np.float64)))
-    usable = (length <= MAX_POINT_DISTANCE) & (length >= options.min_range) & (length > 0.0)
-    if options.max_range is None and usable.all():
-        return points, usable
-    out = np.where(usable[:, None], points, np.float32(np.nan))
-    if options.max_range is None:
-        return out, usable
-    far = usable & (length >= options.max_range)
-    end = options.max_range if options.free_range is None else options.free_range
-    out[far] *= (end / length[far])[:, None].astype(np.float32)
-    return out, usable & ~far
 
 
 def reorder_scans(
@@ -242,8 +228,9 @@ class SkippedRecords:
             )
         ]
 
-    def to_dict(self) -> dict[str, Any]:
+    def by_reason(self) -> dict[str, Skipped]:
+        """As `Recording.source` notes them."""
         return {
-            reason: {"count": count, "lines": sorted(self._lines[reason])}
+            reason: Skipped(count, sorted(self._lines[reason]))
             for reason, count in self._count.items()
         }

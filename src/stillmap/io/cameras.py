@@ -13,17 +13,18 @@ translation = [0.2, 0.0, 0.5]    # of T_base_camera; camera axes: x right, y dow
 quaternion = [-0.5, 0.5, -0.5, 0.5]
 """
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
 
 from stillmap.core.camera import Camera, Images
-from stillmap.core.config import load_toml
+from stillmap.core.config import STRICT, load_toml, override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.core.recording import Recording
 from stillmap.io.images import EXTENSIONS, read_image, read_image_size
@@ -38,47 +39,129 @@ from stillmap.io.scan_files import (
 
 Float = NDArray[np.float64]
 
+# counts of the numbers of each distortion model
 MODELS = {"": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 
-_FOCAL = ("fx", "fy", "cx", "cy")
-_SIZE = ("width", "height")
-_POSE = ("T_base_camera", "translation", "quaternion", "rpy")
-_KEYS = (
-    *("K", *_FOCAL, *_SIZE, "model", "distortion", *_POSE),
-    *("time_offset", "folder", "times"),
-)
-_MAX_NUMBER = 1e6  # pixels, metres, seconds
-_MAX_SIZE = 1 << 16  # pixels
+_Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # pixels, metres, seconds
+_Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
+_Matrix = list[_Number] | list[list[_Number]]
+_Path = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, config=STRICT)
 class CameraOverride:
-    """Values of one camera; None: not given.
+    """Values of one camera; None: not given. See the beginning of this file.
 
     Attributes:
-        K: (3, 3) pinhole matrix.
-        width, height: pixels.
-        model, distortion: see Camera; both or neither.
-        T_base_camera: (4, 4).
-        time_offset_ns: added to the stamps of its images.
-        folder: of images outside the recording.
+        time_offset: seconds added to the stamps of its images.
+        folder: of images outside the recording, seen from the file.
         times: file with their stamps; None: from their names.
     """
 
-    K: Float | None = None
-    width: int | None = None
-    height: int | None = None
-    model: str | None = None
-    distortion: Float | None = None
-    T_base_camera: Float | None = None
-    time_offset_ns: int = 0
-    folder: Path | None = None
-    times: Path | None = None
+    K: _Matrix | None = None
+    fx: _Number | None = None
+    fy: _Number | None = None
+    cx: _Number | None = None
+    cy: _Number | None = None
+    width: _Pixels | None = None
+    height: _Pixels | None = None
+    model: Literal["", "plumb_bob", "rational_polynomial", "equidistant"] | None = None
+    distortion: list[_Number] | None = None
+    T_base_camera: _Matrix | None = None
+    translation: list[_Number] | None = None
+    quaternion: list[_Number] | None = None
+    rpy: list[_Number] | None = None
+    time_offset: _Number = 0.0
+    folder: _Path | None = None
+    times: _Path | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.width is None) != (self.height is None):
+            raise ValueError("'width' and 'height' go together")
+        if self.times is not None and self.folder is None:
+            raise ValueError("'times' is for a 'folder' of images")
+        if self.distortion is not None and self.model is None:
+            raise ValueError(f"'distortion' needs 'model': one of {', '.join(MODELS)}")
+        count = len(self.distortion or ())
+        if self.model is not None and count not in MODELS[self.model]:
+            needed = " or ".join(map(str, MODELS[self.model]))
+            what = f"'distortion' of model '{self.model}' needs {needed} numbers"
+            raise ValueError(f"{what}, got {count}")
+        self.intrinsics()
+        self.pose()
+        return self
+
+    def intrinsics(self) -> Float | None:
+        """(3, 3) pinhole matrix."""
+        given = [v for v in (self.fx, self.fy, self.cx, self.cy) if v is not None]
+        if len(given) not in (0, 4) or (given and self.K is not None):
+            raise ValueError("give either 'K', or 'fx', 'fy', 'cx' and 'cy'")
+        if given:
+            fx, fy, cx, cy = given
+            K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        elif self.K is None:
+            return None
+        else:
+            K = _to_matrix("K", self.K, 3)
+        if not (K[0, 0] > 0.0 and K[1, 1] > 0.0 and K[1, 0] == 0.0):
+            raise ValueError("focal lengths must be positive")
+        return K
+
+    def pose(self) -> Float | None:
+        """(4, 4) T_base_camera."""
+        t, angles = self.translation, [v for v in (self.quaternion, self.rpy) if v is not None]
+        if self.T_base_camera is not None:
+            if t is not None or angles:
+                raise ValueError("'T_base_camera' excludes 'translation', 'quaternion' and 'rpy'")
+            T = _to_matrix("T_base_camera", self.T_base_camera, 4)
+            return rigid_transform(T[:3, :3], T[:3, 3])
+        if t is None and not angles:
+            return None
+        if t is None or len(t) != 3 or len(angles) != 1:
+            raise ValueError("a pose needs 'translation', and one of 'quaternion' and 'rpy'")
+        from scipy.spatial.transform import Rotation  # slow to load
+
+        if len(angles[0]) != (4 if self.rpy is None else 3):
+            raise ValueError("'quaternion' has 4 numbers, 'rpy' 3")
+        if self.rpy is not None:
+            return rigid_transform(Rotation.from_euler("xyz", self.rpy).as_matrix(), t)
+        if not abs(np.linalg.norm(angles[0]) - 1.0) < 0.02:
+            raise ValueError("'quaternion' (x, y, z, w) is not of length one")
+        return rigid_transform(Rotation.from_quat(angles[0]).as_matrix(), t)
+
+    @property
+    def time_offset_ns(self) -> int:
+        """Nanoseconds added to the stamps of its images."""
+        return round(self.time_offset * 1e9)
 
     def apply_to(self, camera: Camera) -> Camera:
         """The camera with the given values in place of its own."""
-        names = ("K", *_SIZE, "model", "distortion", "T_base_camera")
-        return replace(camera, **{n: v for n in names if (v := getattr(self, n)) is not None})
+        distortion = None if self.model is None else np.array(self.distortion or (), np.float64)
+        given = {
+            "K": self.intrinsics(),
+            "width": self.width,
+            "height": self.height,
+            "model": self.model,
+            "distortion": distortion,
+            "T_base_camera": self.pose(),
+        }
+        return replace(camera, **{name: v for name, v in given.items() if v is not None})
+
+
+def _to_matrix(name: str, numbers: list[float] | list[list[float]], n: int) -> Float:
+    """A matrix (n, n) whose last row is 0 ... 0 1.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        matrix = np.array(numbers, np.float64).reshape(n, n)
+    except ValueError as error:
+        raise ValueError(f"'{name}' needs {n} x {n} numbers") from error
+    if not np.array_equal(matrix[-1], np.eye(n)[-1]):
+        raise ValueError(f"the last row of '{name}' must be {', '.join('0' * (n - 1))}, 1")
+    return matrix
 
 
 def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str, CameraOverride]:
@@ -101,9 +184,10 @@ def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str
             raise InputError(what, where=str(path), hint=_hint(name, known))
     for name, table in tables.items():
         try:
-            out[name] = _parse_camera(table, path.parent)
-        except ValueError as error:
-            raise InputError(f"camera '{name}': {error}", where=str(path)) from error
+            out[name] = override(CameraOverride(), table)
+        except InputError as error:
+            what = f"camera '{name}': {error.what}"
+            raise InputError(what, where=str(path), hint=error.hint) from error
     if not out:
         raise InputError("names no camera", where=str(path), hint="a table for each: [NAME]")
     return out
@@ -113,142 +197,6 @@ def _hint(name: str, known: Sequence[str]) -> str:
     if not known:
         return "the recording has no images; folder = '...' adds some"
     return f"nearest: '{closest_match(name, known, min_similarity=0.0)}'; folder = '...' adds one"
-
-
-def _parse_camera(table: Mapping[str, Any], folder: Path) -> CameraOverride:
-    for key in table:
-        if key not in _KEYS:
-            raise ValueError(
-                f"unknown key '{key}' (nearest: '{closest_match(key, _KEYS, min_similarity=0.0)}')"
-            )
-    model, distortion = _parse_distortion(table)
-    width, height = (_parse_size(table, key) for key in _SIZE)
-    if (width is None) != (height is None):
-        raise ValueError("'width' and 'height' go together")
-    if "times" in table and "folder" not in table:
-        raise ValueError("'times' is for a 'folder' of images")
-    offset = _parse_numbers(table, "time_offset", ())
-    return CameraOverride(
-        K=_parse_K(table),
-        width=width,
-        height=height,
-        model=model,
-        distortion=distortion,
-        T_base_camera=_parse_pose(table),
-        time_offset_ns=0 if offset is None else round(float(offset) * 1e9),
-        folder=_parse_path(table, "folder", folder),
-        times=_parse_path(table, "times", folder),
-    )
-
-
-def _parse_K(table: Mapping[str, Any]) -> Float | None:
-    K = _parse_numbers(table, "K", (3, 3))
-    given = [key for key in _FOCAL if key in table]
-    if K is None and given:
-        missing = [key for key in _FOCAL if key not in table]
-        if missing:
-            raise ValueError(f"'{given[0]}' wants '{missing[0]}' beside it")
-        fx, fy, cx, cy = (float(_parse_numbers(table, key, ())) for key in _FOCAL)  # type: ignore[arg-type]
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    elif given:
-        raise ValueError(f"'K' and '{given[0]}' exclude each other")
-    if K is None:
-        return None
-    if not (K[0, 0] > 0.0 and K[1, 1] > 0.0 and K[1, 0] == 0.0):
-        raise ValueError("focal lengths must be positive")
-    if not np.array_equal(K[2], [0.0, 0.0, 1.0]):
-        raise ValueError("the last row of 'K' must be 0, 0, 1")
-    return K
-
-
-def _parse_distortion(table: Mapping[str, Any]) -> tuple[str | None, Float | None]:
-    model = table.get("model")
-    distortion = _parse_numbers(table, "distortion", (-1,))
-    if model is None:
-        if distortion is not None:
-            raise ValueError(f"'distortion' wants 'model': one of {_models()}")
-        return None, None
-    if not isinstance(model, str) or model not in MODELS:
-        raise ValueError(f"'model' must be one of {_models()}, got {model!r}")
-    distortion = np.zeros(0) if distortion is None else distortion
-    if len(distortion) not in MODELS[model]:
-        wanted = " or ".join(str(n) for n in MODELS[model])
-        what = f"'distortion' of model '{model}' wants {wanted} numbers"
-        raise ValueError(f"{what}, got {len(distortion)}")
-    return model, distortion
-
-
-def _models() -> str:
-    return ", ".join(f"'{name}'" for name in MODELS)
-
-
-def _parse_pose(table: Mapping[str, Any]) -> Float | None:
-    given = [key for key in _POSE if key in table]
-    if not given:
-        return None
-    T = _parse_numbers(table, "T_base_camera", (4, 4))
-    if T is not None:
-        if len(given) > 1:
-            raise ValueError(f"'T_base_camera' and '{given[1]}' exclude each other")
-        if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
-            raise ValueError("the last row of 'T_base_camera' must be 0, 0, 0, 1")
-        return rigid_transform(T[:3, :3], T[:3, 3])
-    t = _parse_numbers(table, "translation", (3,))
-    q, rpy = _parse_numbers(table, "quaternion", (4,)), _parse_numbers(table, "rpy", (3,))
-    if t is None or (q is None) == (rpy is None):
-        raise ValueError("a pose wants 'translation', and one of 'quaternion' and 'rpy'")
-    from scipy.spatial.transform import Rotation  # slow to load
-
-    if rpy is not None:
-        return rigid_transform(Rotation.from_euler("xyz", rpy).as_matrix(), t)
-    assert q is not None
-    if not abs(np.linalg.norm(q) - 1.0) < 0.02:
-        raise ValueError("'quaternion' (x, y, z, w) is not of length one")
-    return rigid_transform(Rotation.from_quat(q).as_matrix(), t)
-
-
-def _parse_size(table: Mapping[str, Any], key: str) -> int | None:
-    value = table.get(key)
-    if value is not None and not (type(value) is int and 0 < value <= _MAX_SIZE):
-        raise ValueError(f"'{key}' wants a count of pixels")
-    return value
-
-
-def _parse_path(table: Mapping[str, Any], key: str, folder: Path) -> Path | None:
-    value = table.get(key)
-    if value is None:
-        return None
-    if not isinstance(value, str) or not value or "\0" in value:
-        raise ValueError(f"'{key}' wants a path")
-    return folder / value
-
-
-def _parse_numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Float | None:
-    """The numbers of a key in a shape, (-1,) for any count; None where the key is missing.
-
-    Raises:
-        ValueError: it holds something else, or another count of numbers.
-    """
-    if key not in table:
-        return None
-    flat = list(_flatten(table[key], key))
-    count = math.prod(shape)
-    if (count >= 0 and len(flat) != count) or (shape == ()) == isinstance(table[key], list):
-        wanted = "a number" if shape == () else f"{' x '.join(map(str, shape))} numbers"
-        raise ValueError(f"'{key}' wants {wanted}")
-    return np.array(flat).reshape(shape)
-
-
-def _flatten(value: Any, key: str) -> Iterator[float]:
-    for one in value if isinstance(value, list) else [value]:
-        if isinstance(one, list):
-            yield from _flatten(one, key)
-        elif isinstance(one, bool) or not isinstance(one, int | float):
-            raise ValueError(f"'{key}' wants numbers")
-        elif not abs(one) <= _MAX_NUMBER:
-            raise ValueError(f"'{key}' wants smaller numbers")
-        else:
-            yield float(one)
 
 
 _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((0, 0)))
@@ -262,19 +210,20 @@ def apply_camera_file(recording: Recording, path: Path) -> Recording:
     """
     images = recording.images or _NO_IMAGES
     recorded = [camera.name for camera in images.cameras]
-    overrides = read_camera_file(path, [*recorded, *depth_camera_names(recording.source)])
-    for name, one in overrides.items():
-        if one.folder is not None and name in recorded:
+    depth = [sensor.name for sensor in recording.source.sensors if sensor.grid]
+    overrides = read_camera_file(path, [*recorded, *depth])
+    parts = [_apply_overrides(images, overrides)]
+    for name, given in overrides.items():
+        if given.folder is None:
+            continue
+        if name in recorded:
             what = f"camera '{name}' has images in the recording: 'folder' is for others"
             raise InputError(what, where=str(path))
-    parts = [_apply_overrides(images, overrides)]
-    for name, one in overrides.items():
-        if one.folder is not None:
-            try:
-                parts.append(_read_folder(name, one, one.folder, str(path)))
-            except InputError as error:
-                hint = error.hint or f"camera '{name}' of {path}"
-                raise InputError(error.what, where=error.where, hint=hint) from error
+        try:
+            parts.append(_read_folder(name, given, path.parent / given.folder, path))
+        except InputError as error:
+            hint = error.hint or f"camera '{name}' of {path}"
+            raise InputError(error.what, where=error.where, hint=hint) from error
     merged = merge_images(parts)
     return replace(recording, images=merged if merged.cameras else None)
 
@@ -282,12 +231,9 @@ def apply_camera_file(recording: Recording, path: Path) -> Recording:
 def add_calibration_warnings(recording: Recording) -> Recording:
     """Add a warning for each camera whose calibration is implausible, unless it is there."""
     cameras = recording.images.cameras if recording.images is not None else ()
-    recorded = recording.source.get("warnings")
-    warnings = recorded if isinstance(recorded, list) else []
+    warnings = recording.source.warnings
     new = [what for camera in cameras if (what := validate_camera(camera)) and what not in warnings]
-    if not new:
-        return recording
-    return replace(recording, source={**recording.source, "warnings": [*warnings, *new]})
+    return replace(recording, source=replace(recording.source, warnings=[*warnings, *new]))
 
 
 def validate_camera(camera: Camera) -> str:
@@ -303,16 +249,9 @@ def validate_camera(camera: Camera) -> str:
     )
 
 
-def depth_camera_names(source: dict[str, Any]) -> list[str]:
-    """Names of the sensors that are depth cameras: their scans are grids."""
-    recorded = source.get("sensors")
-    sensors = recorded if isinstance(recorded, list) else []
-    return [str(one.get("name")) for one in sensors if isinstance(one, dict) and one.get("grid")]
-
-
 def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Images:
     """The images of one camera, from stamps (ns) and files in any order."""
-    ordered = sorted(files, key=lambda one: one[0])
+    ordered = sorted(files, key=lambda pair: pair[0])
     return Images(
         stamp_ns=np.array([stamp for stamp, _ in ordered], np.int64),
         camera=np.zeros(len(ordered), np.int32),
@@ -326,12 +265,12 @@ def merge_images(parts: Sequence[Images]) -> Images:
     if len(parts) == 1:
         return parts[0]
     cameras: dict[str, Camera] = {}
-    for one in (camera for part in parts for camera in part.cameras):
-        cameras.setdefault(one.name, one)
+    for camera in (camera for part in parts for camera in part.cameras):
+        cameras.setdefault(camera.name, camera)
     numbers = {name: number for number, name in enumerate(cameras)}
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
-    camera = np.concatenate(
-        [np.array([numbers[one.name] for one in part.cameras])[part.camera] for part in parts]
+    number_of = np.concatenate(
+        [np.array([numbers[each.name] for each in part.cameras])[part.camera] for part in parts]
     )
     part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     number = np.concatenate([np.arange(len(part)) for part in parts])
@@ -339,7 +278,7 @@ def merge_images(parts: Sequence[Images]) -> Images:
     part_of, number = part_of[order].tolist(), number[order].tolist()
     return Images(
         stamp_ns[order],
-        camera[order].astype(np.int32),
+        number_of[order].astype(np.int32),
         tuple(cameras.values()),
         lambda image: parts[part_of[image]].read(number[image]),
     )
@@ -349,10 +288,10 @@ def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Im
     """Images of the recording with overridden cameras, sorted again by their shifted stamps."""
     cameras, stamp_ns = list(images.cameras), images.stamp_ns.copy()
     for number, camera in enumerate(cameras):
-        one = overrides.get(camera.name)
-        if one is not None:
-            cameras[number] = one.apply_to(camera)
-            stamp_ns[images.camera == number] += one.time_offset_ns
+        given = overrides.get(camera.name)
+        if given is not None:
+            cameras[number] = given.apply_to(camera)
+            stamp_ns[images.camera == number] += given.time_offset_ns
     order = np.argsort(stamp_ns, kind="stable")
     return Images(
         stamp_ns[order],
@@ -362,26 +301,25 @@ def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Im
     )
 
 
-def _read_folder(name: str, override: CameraOverride, folder: Path, where: str) -> Images:
+def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) -> Images:
     """Images of a folder outside the recording."""
     files = list_files(folder, EXTENSIONS)
     if not files:
         raise InputError("holds no images", where=str(folder))
-    if override.times is not None:
-        times = read_times(override.times)
-        rows = assign_rows(files, len(times), override.times)
+    if given.times is not None:
+        file = where.parent / given.times
+        times = read_times(file)
+        rows = assign_rows(files, len(times), file)
         stamps = [None if row is None else times[row] for row in rows]
     else:
-        found = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
-        if found is None:
+        named = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
+        if named is None:
             hint = f"times = 'FILE' in camera '{name}' of {where}: one line of seconds per image"
             raise InputError("holds images whose names are no stamps", where=str(folder), hint=hint)
-        stamps = list(found)
+        stamps = list(named)
     used = [(s, f) for s, f in zip(stamps, files, strict=True) if s is not None]
     if not used:
-        raise InputError("holds no usable stamp", where=str(override.times))
+        raise InputError("holds no usable stamp", where=str(given.times))
     width, height = read_image_size(used[0][1])
-    camera = override.apply_to(Camera(name, width, height, None, "", np.zeros(0), None))
-    return images_from_files(
-        [(stamp + override.time_offset_ns, file) for stamp, file in used], camera
-    )
+    camera = given.apply_to(Camera(name, width, height, None, "", np.zeros(0), None))
+    return images_from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)

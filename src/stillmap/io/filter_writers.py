@@ -16,7 +16,6 @@ from stillmap.core import arrays
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
-from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
 from stillmap.io import filtered_clouds, stillmap_folder, writers
 from stillmap.io.carmen import writer as carmen
@@ -24,7 +23,6 @@ from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
 from stillmap.io.registry import FORMATS, detect_format
 from stillmap.io.ros import filtered as filtered_bags
 from stillmap.io.ros.messages import detect_kind
-from stillmap.prepare.beam_times import SPIN_KEY
 
 Write = Callable[[FilterJob], Omissions]
 
@@ -58,7 +56,7 @@ def _write_stillmap(job: FilterJob) -> Omissions:
     recording = _to_misses(job)
     folder = job.source if job.source.is_dir() else job.source.parent
     if not stillmap_folder.has_beam_times(folder):  # times that were estimated stay out
-        source = {key: value for key, value in recording.source.items() if key != SPIN_KEY}
+        source = replace(recording.source, spin=None)
         recording = replace(recording, beam_time=None, source=source)
     stillmap_folder.write(recording, job.output, overwrite=job.overwrite)
     return Omissions()
@@ -171,7 +169,7 @@ def _convert(job: FilterJob, writer: writers.Writer, note: str) -> Omissions:
         recording = _without_beams(job)
     losses = writers.write(recording, job.output, name=writer.name, overwrite=job.overwrite)
     notes = [*([note + writer.description] if note else []), *losses]
-    return Omissions(count_skipped(job.recording.source), tuple(notes))
+    return Omissions(job.recording.source.n_skipped, tuple(notes))
 
 
 def _to_misses(job: FilterJob) -> Recording:

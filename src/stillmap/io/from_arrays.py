@@ -1,6 +1,10 @@
 """Recordings from arrays in memory, and checks of arrays: each error names argument and shape."""
 
+# signatures name ArrayLike instead of spelling it out
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
-from stillmap.io.builder import ReadContext, RecordingBuilder
+from stillmap.io.builder import RecordingBuilder
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
-from stillmap.prepare.lasers import RawLaser, RawLasers, place_beams, unit_vectors
+from stillmap.prepare.lasers import RawLaser, RawLasers, unit_vectors
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-from stillmap.prepare.self_filter import remove_self_returns
+from stillmap.prepare.prepare import prepare
 
 Float = NDArray[np.float64]
 
@@ -28,14 +33,38 @@ def recording_from_scans(
     stamps: ArrayLike,
     ranges: ArrayLike,
     angles: ArrayLike,
-    odometry: ArrayLike | None,
+    odometry: ArrayLike | None = None,
     *,
-    min_range: float,
-    max_range: float | None,
-    sensor_pose: ArrayLike | None,
-    time_increment: float,
+    min_range: float = 0.0,
+    max_range: float | None = None,
+    sensor_pose: ArrayLike | None = None,
+    time_increment: float = 0.0,
 ) -> Recording:
-    """See `Recording.from_scans`."""
+    """A 2D recording from the arrays of a laser scanner.
+
+    Readings mean what they mean in a ROS LaserScan: NaN, negative and near zero: unusable;
+    +inf and readings from `max_range` on: nothing within reach, the beam shows free space.
+    As when a file is read, values that repeat at the top of the readings are recognised as
+    codes of the maximum range, and returns from the robot itself are removed.
+
+    Args:
+        stamps: (T,) not decreasing; floats are seconds, integers nanoseconds, or datetime64.
+        ranges: (T, N) metres, one row per scan.
+        angles: (N,) radians in the sensor frame, counter-clockwise, in any order.
+        odometry: (T, 3) x, y (m), theta (rad), or (T, 3, 3) T_odom_base; None: no odometry.
+        min_range: metres; shorter readings are unusable.
+        max_range: metres; readings from it on are maximum range; None: found in the readings.
+        sensor_pose: of the laser on the robot, (3,) x, y, theta or (3, 3); None: at the
+            robot's centre, unless the motion shows another place when the map is built.
+        time_increment: seconds from beam to beam; the stamp is that of the first beam.
+
+    Raises:
+        ValueError: names the argument, what was expected, and what it was.
+
+    Examples:
+        >>> recording = stillmap.Recording.from_scans(stamps, ranges, angles, odometry)
+        >>> result = stillmap.build(recording)
+    """
     stamp_ns = stamps_to_ns(stamps)
     readings = to_array("ranges", ranges, "(T, N)")
     T, N = readings.shape
@@ -49,10 +78,10 @@ def recording_from_scans(
         what = f"expected scans of up to {MAX_BEAM_TIME:g} s"
         raise ValueError(f"time_increment: {what}, got {time_increment}")
     options = _read_options(min_range, max_range)
-    notes: dict[str, Any] = {"beams_per_scan": N}
-    steps = np.diff(directions)
+    sensor, steps = _describe_sensor(sensor_pose, beams_per_scan=N), np.diff(directions)
     if len(steps) and np.ptp(steps) <= 1e-6:  # as writers of LaserScan want them
-        notes |= {"start_angle": float(directions[0]), "angle_step": float(steps.mean())}
+        first, step = float(directions[0]), float(steps.mean())
+        sensor = replace(sensor, start_angle=first, angle_step=step)
     mount = _sensor_matrix(sensor_pose, 2)
     T_odom_base = None if odometry is None else poses_to_matrices("odometry", odometry, T, 2)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -65,27 +94,46 @@ def recording_from_scans(
             [unit_vectors(directions).astype(np.float32)],
             (time_increment,),
         )
-        raw = RawLasers([laser], [mount], T_odom_base, _source(notes, sensor_pose))
-        return place_beams(raw, options, None)
+        source = Source(format=FORMAT, sensors=[sensor])
+        return prepare(RawLasers([laser], [mount], T_odom_base, source), options)
 
 
 def recording_from_clouds(
     stamps: ArrayLike,
     clouds: Iterable[ArrayLike],
-    odometry: ArrayLike | None,
+    odometry: ArrayLike | None = None,
     *,
-    min_range: float,
-    max_range: float | None,
-    sensor_pose: ArrayLike | None,
-    beam_times: Sequence[ArrayLike] | None,
+    min_range: float = 0.0,
+    max_range: float | None = None,
+    sensor_pose: ArrayLike | None = None,
+    beam_times: Sequence[ArrayLike] | None = None,
 ) -> Recording:
-    """See `Recording.from_clouds`."""
+    """A 3D recording from point clouds, one per sweep of a lidar.
+
+    Args:
+        stamps: (T,) not decreasing; floats are seconds, integers nanoseconds, or datetime64.
+        clouds: T arrays (N_t, 3) in the sensor frame, metres; a generator will do. Points that
+            are not finite, at the origin or implausibly far are unusable.
+        odometry: (T, 4, 4) T_odom_base; None: no odometry.
+        min_range: metres; nearer points are unusable.
+        max_range: metres; points from it on are maximum range; None: every point is a hit.
+        sensor_pose: (4, 4) of the lidar on the robot; None: at the robot's centre.
+        beam_times: T arrays (N_t,) of seconds after the stamp; None: all points of a cloud
+            have its stamp.
+
+    Raises:
+        ValueError: names the argument, what was expected, and what it was.
+
+    Examples:
+        >>> sweeps = (numpy.load(file) for file in files)
+        >>> recording = stillmap.Recording.from_clouds(stamps, sweeps)
+    """
     stamp_ns = stamps_to_ns(stamps)
     T = len(stamp_ns)
     if beam_times is not None:
         require_length("beam_times", len(beam_times), T, "stamps")
-    context = ReadContext(_read_options(min_range, max_range))
-    builder = RecordingBuilder(3, context, beam_times=beam_times is not None)
+    options = _read_options(min_range, max_range)
+    builder = RecordingBuilder(3, None, beam_times=beam_times is not None)
     with np.errstate(over="ignore", invalid="ignore"):
         for t, cloud in enumerate(clouds):
             if t >= T:
@@ -100,10 +148,10 @@ def recording_from_clouds(
         require_length("clouds", len(builder), T, "stamps")
         recording = builder.build(
             _sensor_matrix(sensor_pose, 3),
-            source=_source({}, sensor_pose),
+            source=Source(format=FORMAT, sensors=[_describe_sensor(sensor_pose)]),
             T_odom_base=None if odometry is None else poses_to_matrices("odometry", odometry, T, 3),
         )
-        return remove_self_returns(recording)
+        return prepare(recording, options)
 
 
 def _read_options(min_range: float, max_range: float | None) -> ReadOptions:
@@ -127,11 +175,10 @@ def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
     return poses_to_matrices("sensor_pose", given[None], 1, dimension)
 
 
-def _source(notes: dict[str, Any], sensor_pose: ArrayLike | None) -> dict[str, Any]:
+def _describe_sensor(sensor_pose: ArrayLike | None, **notes: Any) -> SensorNotes:
     # a given pose is kept, another one is calibrated from the motion where that shows it
     how = "given" if sensor_pose is not None else "the sensor is the robot's frame"
-    sensor = {"name": "sensor", **notes, "extrinsics": {"how": how}}
-    return {"format": FORMAT, "sensors": [sensor], "warnings": []}
+    return SensorNotes("sensor", extrinsics=LaserPose(how=how), **notes)
 
 
 def stamps_to_ns(stamps: ArrayLike) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """2D scans in the form of a LaserScan message: first angle, angle step, ranges, time increment."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes
 
 Float = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ def beam_angles(recording: Recording) -> Float:
     counts = np.diff(recording.offset)
     known = {
         number: {int(n): angles for n in np.unique(counts[recording.sensor == number])}
-        for number, angles in enumerate(map(_recorded_angles, _sensor_entries(recording)))
+        for number, angles in enumerate(map(_recorded_angles, _sensor_notes(recording)))
     }
     undetermined = []
     for t in recording.iter_scans(range(recording.n_scans)):
@@ -96,7 +97,7 @@ def range_limits(recording: Recording) -> list[RangeLimits]:
         length, is_hit = np.hypot(x, y), recording.hit[beams]
         hit[s] = max(hit[s], length.max(where=is_hit, initial=0.0))
         far[s] = max(far[s], length.max(where=~is_hit & ~np.isnan(length), initial=0.0))
-    recorded = [_range_threshold(entry) for entry in _sensor_entries(recording)]
+    recorded = [_range_threshold(entry) for entry in _sensor_notes(recording)]
     return [
         RangeLimits(float(h), n or float(f) or None)
         for h, f, n in zip(hit, far, recorded, strict=True)
@@ -124,24 +125,21 @@ def time_increments(recording: Recording) -> tuple[Float, int]:
     return out, uneven
 
 
-def _sensor_entries(recording: Recording) -> list[dict[str, Any]]:
-    """Entry of each sensor in Recording.source, {} where there is none."""
-    recorded = recording.source.get("sensors")
-    recorded = recorded if isinstance(recorded, list) else []
-    count = len(recording.T_base_sensor)
-    found = [one if isinstance(one, dict) else {} for one in recorded[:count]]
-    return found + [{}] * (count - len(found))
+def _sensor_notes(recording: Recording) -> list[SensorNotes]:
+    """Notes on each sensor, empty ones where there are none."""
+    recorded, count = recording.source.sensors, len(recording.T_base_sensor)
+    return recorded[:count] + [SensorNotes()] * (count - len(recorded))
 
 
-def _recorded_angles(notes: dict[str, Any]) -> tuple[float, float] | None:
-    start, step = (notes.get(name) for name in ("start_angle", "angle_step"))
-    return (start, step) if isinstance(start, float) and isinstance(step, float) else None
+def _recorded_angles(notes: SensorNotes) -> tuple[float, float] | None:
+    if notes.start_angle is None or notes.angle_step is None:
+        return None
+    return notes.start_angle, notes.angle_step
 
 
-def _range_threshold(notes: dict[str, Any]) -> float | None:
-    rule = notes.get("ranges")
-    value = rule.get("threshold") if isinstance(rule, dict) else None
-    return value if isinstance(value, float) and 0.0 < value < np.inf else None
+def _range_threshold(notes: SensorNotes) -> float | None:
+    value = None if notes.ranges is None else notes.ranges.threshold
+    return value if value is not None and value > 0.0 else None
 
 
 def _fits(angles: tuple[float, float], points: Float, usable: NDArray[np.intp]) -> bool:

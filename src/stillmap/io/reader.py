@@ -1,20 +1,38 @@
-"""Reads a recording of any format, and prepares it by what all of its scans show."""
+"""Reads a recording of any format, or the parts of one run, and prepares it for mapping."""
 
-from collections.abc import Iterator
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stillmap.core import arrays, se2
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.builder import ReadContext
-from stillmap.io.registry import detect_format
+from stillmap.core.source import Part, SensorNotes, Skipped, Source
+from stillmap.io import cameras
+from stillmap.io.builder import MAX_LINE_NUMBERS, ReadContext, part_context, reorder_scans
+from stillmap.io.registry import Format, detect_format
 from stillmap.io.rigid_transforms import MAX_MOUNT, are_rigid
 from stillmap.io.text_lines import Progress
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.prepare import prepare as prepare_recording
+from stillmap.prepare.prepare import complete, interpret
+from stillmap.prepare.time_window import TimeWindow, select_time
+
+Float = NDArray[np.float64]
+
+_MAX_PAUSE = 60.0  # s between parts: recorders take less to begin a new file
+_MAX_OVERLAP = 3  # scans, of several sensors, that precede the end of the part before
+# odometry from one part to the next: faster than usual, but within reach
+_SPEED_FACTOR, _SHORTEST = 1.5, 0.02  # s between scans over which speed is measured
+_SLACK, _ROUNDING = 0.5, 0.05  # s from readings of odometry to the scans; m, rad
 
 
 def read(
@@ -38,30 +56,66 @@ def read(
     """
     path, options = Path(path), options or ReadOptions()
     with explain_failure(path):
-        recording = detect_format(path).read(path, ReadContext(options, progress, scratch))
-        return prepare(recording, options, scratch, str(path))
+        raw = detect_format(path).read(path, ReadContext(options, progress, scratch))
+        return _finish(interpret(raw, options, scratch), options, scratch, str(path))
 
 
-def prepare(
+def read_parts(
+    paths: Sequence[str | Path],
+    options: ReadOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+    in_order: bool = False,
+) -> Recording:
+    """Read the parts of one run as one recording; `source.parts` notes them in order of time.
+
+    Args:
+        paths: of the parts.
+        options, progress, scratch: see `stillmap.io.read`; the time window counts from the start
+            of the first part.
+        in_order: that they follow each other in this order is known.
+
+    Raises:
+        InputError: a part cannot be read, or they do not follow each other.
+    """
+    files, options = [Path(path) for path in paths], options or ReadOptions()
+    if not files:
+        raise InputError("no recording is named")
+    context = ReadContext(options, progress, scratch)
+    with explain_failure(files[0]):
+        forms = [detect_format(path) for path in files]
+        read_all = forms[0].read_parts if all(form is forms[0] for form in forms) else None
+        notes = [Part(path=str(path)) for path in files]
+        if read_all is None or not in_order:
+            parts = [_read_part(files, forms, k, context) for k in range(len(files))]
+            order = sorted(range(len(files)), key=lambda k: parts[k].stamp_ns[[0, -1]].tolist())
+            files, parts = [files[k] for k in order], [parts[k] for k in order]
+            _require_run(files, parts)
+            notes = [_describe(*part) for part in zip(files, parts, strict=True)]
+        if read_all is not None:
+            recording = interpret(read_all(files, context, ()), options, scratch)
+        else:
+            recording = join_recordings(parts, [str(path) for path in files], scratch)
+            window = TimeWindow(options)
+            recording = select_time(recording, window, str(files[0])) if window else recording
+            recording = replace(recording, scratch=scratch)
+        recording = _finish(recording, options, scratch, str(files[0]))
+    recording.source.path, recording.source.parts = notes[0].path, notes
+    return recording
+
+
+def _finish(
     recording: Recording, options: ReadOptions, scratch: Path | None, where: str
 ) -> Recording:
-    """A recording as its reader made it, with what follows from all of its scans.
+    """A recording with what follows from all of its scans, and with the given cameras.
 
     Raises:
         InputError: options are for recordings of another dimension, or a sensor is far from the
             robot.
     """
     require_mounts(recording, where)
-    if recording.dimension == 3:
-        recording = replace(recording, scratch=scratch)
-    try:
-        recording = prepare_recording(recording, options)
-    except InputError as error:
-        raise InputError(error.what, where=where, hint=error.hint) from error
-    if recording.dimension == 2:
-        return recording
-    from stillmap.io import cameras  # nothing that a 2D recording needs
-
+    recording = complete(recording, options, scratch)
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))
     return cameras.add_calibration_warnings(recording)
@@ -78,6 +132,10 @@ def explain_failure(path: Path) -> Iterator[None]:
         # damaged numbers are handled by the readers: no warnings of NumPy
         with np.errstate(over="ignore", invalid="ignore"):
             yield
+    except InputError as error:
+        if error.where:
+            raise
+        raise InputError(error.what, where=str(path), hint=error.hint) from error
     except OSError as error:
         # files may vanish and disks fill up at any moment
         what = f"cannot be read: {error.strerror or error}"
@@ -116,3 +174,195 @@ def require_plausible(recording: Recording, where: str) -> None:
     if recording.T_odom_base is not None and not are_rigid(recording.T_odom_base):
         what = "odometry: expected finite rigid transforms within a million km"
         raise InputError(what, where=where, hint="odometry=False does without")
+
+
+def _read_part(
+    files: list[Path], forms: list[Format], number: int, context: ReadContext
+) -> Recording:
+    """One of several inputs, of which others of its format may state what it lacks."""
+    path, form = files[number], forms[number]
+    context = part_context(context, number, len(files))
+    if form.read_parts is None:
+        raw = form.read(path, context)
+    else:
+        same = [file for file, of in zip(files, forms, strict=True) if of is form and file != path]
+        raw = form.read_parts([path], context, same)
+    recording = interpret(raw, context.options, context.scratch)
+    if not recording.n_scans:
+        raise InputError("holds no scan", where=str(path))
+    return recording
+
+
+def _describe(path: Path, part: Recording) -> Part:
+    first, last = part.stamp_ns[[0, -1]].tolist()
+    return Part(first, last, str(path), part.n_scans)
+
+
+def _require_run(files: list[Path], parts: list[Recording]) -> None:
+    """Refuse recordings that do not follow each other.
+
+    Raises:
+        InputError: one does not go on where the one before ends.
+    """
+    for path, (before, after), (file, _) in zip(
+        files[1:], pairwise(parts), pairwise(files), strict=True
+    ):
+        if why := _find_break(before, after):
+            hint = f"sessions of one place: stillmap merge {shlex.join(map(str, files))} -o DIR"
+            raise InputError(f"does not follow {file}: {why}", where=str(path), hint=hint)
+
+
+def _find_break(before: Recording, after: Recording) -> str:
+    """Why a recording is no part of the run of the one before; "" where it goes on with it."""
+    if before.dimension != after.dimension:
+        return f"it is {after.dimension}D"
+    names = ([sensor.name for sensor in part.source.sensors] for part in (before, after))
+    if next(names) != next(names):
+        return "it has other sensors"
+    if (before.T_odom_base is None) != (after.T_odom_base is None):
+        return "one of them has no odometry"
+    pause = (int(after.stamp_ns[0]) - int(before.stamp_ns[-1])) / 1e9
+    if pause > _MAX_PAUSE:
+        return f"it begins {pause:.0f} s later"
+    overlap = int(np.searchsorted(after.stamp_ns, before.stamp_ns[-1], side="right"))
+    if overlap and (overlap > _MAX_OVERLAP or 2 * overlap >= min(before.n_scans, after.n_scans)):
+        return "it is of the same time"
+    if before.T_odom_base is None or after.T_odom_base is None:
+        return ""
+    return _find_jump(before, after, before.T_odom_base, after.T_odom_base)
+
+
+def _find_jump(before: Recording, after: Recording, A: Float, B: Float) -> str:
+    """How poses of one part do not go on with those of the one before; "" where they do."""
+    step = _measure_motions(A[-1:], B[:1])[0]
+    seconds = abs(int(after.stamp_ns[0]) - int(before.stamp_ns[-1])) / 1e9 + _SLACK
+    usual = np.maximum(_usual_speed(before, A), _usual_speed(after, B))
+    reach = np.maximum(_SPEED_FACTOR * usual, 1.0) * seconds + _ROUNDING
+    starts_anew = np.allclose(B[0], np.eye(len(B[0]))) and step.max() > _ROUNDING
+    if starts_anew or (step > reach).any():
+        return f"its odometry begins {step[0]:.2f} m and {np.degrees(step[1]):.0f} degrees apart"
+    return ""
+
+
+def _usual_speed(recording: Recording, T: Float) -> Float:
+    """(2,) m/s and rad/s of fast motion along poses (T, D+1, D+1)."""
+    if len(T) < 2:
+        return np.zeros(2)
+    seconds = np.maximum(np.diff(recording.stamp_ns) / 1e9, _SHORTEST)
+    speeds = _measure_motions(T[:-1], T[1:]) / seconds[:, None]
+    return np.asarray(np.quantile(speeds, 0.98, axis=0))
+
+
+def _measure_motions(A: Float, B: Float) -> Float:
+    """(n, 2) distances, m, and angles, rad, between poses (n, D+1, D+1)."""
+    step, D = se2.inverse(A) @ B, A.shape[-1] - 1
+    # the angle of a rotation in any dimension follows from its trace
+    cosine = (np.trace(step[:, :D, :D], axis1=1, axis2=2) - (D - 2)) / 2.0
+    metres = np.linalg.norm(step[:, :D, D], axis=1)
+    return np.stack([metres, np.arccos(np.clip(cosine, -1.0, 1.0))], axis=1)
+
+
+def join_recordings(
+    parts: Sequence[Recording], names: Sequence[str], scratch: Path | None
+) -> Recording:
+    """Join the parts of one run, in order of time.
+
+    Args:
+        parts: with at least one scan each.
+        names: of the parts, for messages.
+        scratch: folder of memory-mapped arrays; None: the system's temporary folder.
+
+    Raises:
+        InputError: the clouds of one have another origin.
+    """
+    for name, part in zip(names, parts, strict=True):
+        if part.source.origin != parts[0].source.origin:
+            hint = "move the files of all parts into one folder"
+            raise InputError("has points about another origin", where=name, hint=hint)
+    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
+    length = np.concatenate([np.diff(part.offset) for part in parts])
+    order = np.argsort(stamp_ns, kind="stable")
+    T_base_sensor, sensor, sensors = _join_sensors(parts)
+    source = _join_notes(parts, names, sensors)
+
+    def join_beams(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        builder = ArrayBuilder(columns[0].dtype, columns[0].shape[1:], scratch)
+        for column in columns:
+            for block in arrays.iter_blocks(column):
+                builder.append(column[block])
+        return reorder_scans(builder.finish(), length, order, scratch)
+
+    odometry = [part.T_odom_base for part in parts if part.T_odom_base is not None]
+    recorded = [part.T_recorded_base for part in parts if part.T_recorded_base is not None]
+    if recorded and not _are_continuous(parts, recorded):
+        text = "the recorded poses of the parts do not continue each other: not used"
+        source.warnings.append(text)
+        recorded = []
+    times = [part.beam_time for part in parts if part.beam_time is not None]
+    images = [part.images for part in parts if part.images is not None]
+    return Recording(
+        stamp_ns=stamp_ns[order],
+        offset=np.concatenate([[0], np.cumsum(length[order])]).astype(np.int64),
+        points=join_beams([part.points for part in parts]),
+        hit=join_beams([part.hit for part in parts]),
+        T_base_sensor=T_base_sensor,
+        sensor=sensor[order],
+        T_odom_base=np.concatenate(odometry)[order] if odometry else None,
+        source=source,
+        beam_time=join_beams(times) if len(times) == len(parts) else None,
+        T_recorded_base=np.concatenate(recorded)[order] if recorded else None,
+        images=cameras.merge_images(images) if images else None,
+        scratch=scratch,
+    )
+
+
+def _are_continuous(parts: Sequence[Recording], poses: Sequence[Float]) -> bool:
+    """True if all parts have poses, which go on from one to the next."""
+    if len(poses) < len(parts):
+        return False
+    pairs = zip(pairwise(parts), pairwise(poses), strict=True)
+    return not any(_find_jump(*pair, *ends) for pair, ends in pairs)
+
+
+def _join_sensors(
+    parts: Sequence[Recording],
+) -> tuple[Float, NDArray[np.int32], list[SensorNotes]]:
+    """Poses of the sensors of all parts, that of each scan, and the notes on them.
+
+    Those of the first part, unless one moves: then it has a pose per place, and one note.
+    """
+    poses, sensor = [part.T_base_sensor for part in parts], [part.sensor for part in parts]
+    notes = [note for part in parts for note in part.source.sensors]
+    if any(note.places > 1 for note in notes) or len({len(T) for T in poses}) > 1:
+        first = np.cumsum([0, *map(len, poses[:-1])]).tolist()
+        shifted = [(own + n).astype(np.int32) for own, n in zip(sensor, first, strict=True)]
+        return np.concatenate(poses), np.concatenate(shifted), notes
+    scans: Counter[str] = Counter()
+    for note in notes:
+        scans[note.name] += note.scans or 0
+    joined = [replace(s, scans=scans[s.name] or None) for s in parts[0].source.sensors]
+    return poses[0], np.concatenate(sensor), joined
+
+
+def _join_notes(
+    parts: Sequence[Recording], names: Sequence[str], sensors: list[SensorNotes]
+) -> Source:
+    """The notes of the first part, with the warnings and the damage of all."""
+    noted = [part.source for part in parts]
+
+    def join(key: str) -> dict[str, Skipped]:
+        return {
+            f"{reason} (in {Path(name).name})": replace(own, lines=own.lines[:MAX_LINE_NUMBERS])
+            for name, source in zip(names, noted, strict=True)
+            for reason, own in getattr(source, key).items()
+        }
+
+    return replace(
+        noted[0],
+        format=", ".join(dict.fromkeys(str(source.format) for source in noted)),
+        warnings=list(dict.fromkeys(text for source in noted for text in source.warnings)),
+        sensors=sensors,
+        skipped=join("skipped"),
+        skipped_odometry=join("skipped_odometry"),
+        damage=join("damage"),
+    )

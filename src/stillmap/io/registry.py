@@ -20,7 +20,8 @@ from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
 from stillmap.io.ros import messages
 from stillmap.io.scan_files import contains_files, has_extension
 from stillmap.io.text_lines import read_head
-from stillmap.prepare.prepare import apply_options
+from stillmap.prepare.lasers import RawLasers
+from stillmap.prepare.time_window import TimeWindow, select_time
 
 RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated robot
 
@@ -29,9 +30,9 @@ _MAX_ENTRIES = 1000  # of a folder, searched for recordings
 _MAX_LISTED = 3  # recordings in a message
 _FORMATS_HINT = "`stillmap info -h` lists the formats"
 
-Reader = Callable[[Path, ReadContext], Recording]
+Reader = Callable[[Path, ReadContext], Recording | RawLasers]
 # reads parts of a run, in order of time, as one recording; others may be further parts
-PartsReader = Callable[[Sequence[Path], ReadContext, Sequence[Path]], Recording]
+PartsReader = Callable[[Sequence[Path], ReadContext, Sequence[Path]], Recording | RawLasers]
 
 
 class Format(NamedTuple):
@@ -65,30 +66,24 @@ def _is_stillmap_folder(path: Path, start: bytes | None) -> bool:
 
 
 def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
-    folder = path if path.is_dir() else path.parent
+    folder, options = path if path.is_dir() else path.parent, context.options
+    of_bags = ("topic", "tilting_topic", "base_frame", "odom_frame")
+    for name in of_bags:
+        if getattr(options, name) is not None:
+            what = f"read.{name} is for bags: this recording has no topics and frames"
+            raise InputError(what, where=str(path))
     recording = stillmap_folder.read(folder, context.scratch)
-    try:
-        return apply_options(recording, context.options)
-    except InputError as error:
-        where = error.where or str(path)
-        raise InputError(error.what, where=where, hint=error.hint) from error
+    window = TimeWindow(options)
+    return select_time(recording, window, str(path)) if window else recording
 
 
-def _is_kitti_folder(path: Path, start: bytes | None) -> bool:
-    return start is None and kitti.is_kitti_folder(path)
-
-
-def _is_rgbd_folder(path: Path, start: bytes | None) -> bool:
-    return start is None and rgbd.detect_layout(path) is not None
+def _of_folder(is_one: Callable[[Path], bool]) -> Callable[[Path, bytes | None], bool]:
+    return lambda path, start: start is None and is_one(path)
 
 
 def _load(module: str, function: str = "read") -> Any:
     """A function of a module of this room, which is loaded when it is called."""
-
-    def call(*args: Any) -> Any:
-        return getattr(import_module(f"stillmap.io.{module}"), function)(*args)
-
-    return call
+    return lambda *args: getattr(import_module(f"stillmap.io.{module}"), function)(*args)
 
 
 def _point_cloud_format(
@@ -112,8 +107,18 @@ FORMATS = (
         "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
     Format("ROS bag", messages.ENDINGS, messages.is_bag, _load(_ROS), _load(_ROS, "read_parts")),
-    Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti_folder, kitti.read),
-    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, rgbd.read),
+    Format(
+        "KITTI folder",
+        ("velodyne/", "velodyne_points/"),
+        _of_folder(kitti.is_kitti_folder),
+        kitti.read,
+    ),
+    Format(
+        "RGB-D folder",
+        ("frame-*.depth.png", "depth.txt"),
+        _of_folder(rgbd.is_rgbd_folder),
+        rgbd.read,
+    ),
     _point_cloud_format("PCD", pcd.EXTENSIONS, pcd.read, pcd.is_pcd),
     _point_cloud_format("3DTK", threedtk.EXTENSIONS, threedtk.read),
     _point_cloud_format("E57", e57.EXTENSIONS, e57.read, e57.is_e57),

@@ -24,13 +24,14 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError, advise
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes, Source
 from stillmap.core.timestamps import parse_ns
 from stillmap.io import cameras
 from stillmap.io.builder import ReadContext
 from stillmap.io.cameras import CameraOverride
 from stillmap.io.images import read_image, read_image_size
-from stillmap.io.point_cloud.clouds import Cloud, CloudSource, DatasetInfo, build_recording, reject
-from stillmap.io.rgbd_calibration import align_to_gravity, calibrate_color_camera
+from stillmap.io.point_cloud.clouds import Cloud, CloudSource, build_recording, reject
+from stillmap.io.rgbd_calibration import calibrate_color_camera
 from stillmap.io.rigid_transforms import rigid_transform
 from stillmap.io.text_lines import read_lines
 from stillmap.io.trajectory import read_tum
@@ -80,6 +81,11 @@ def detect_layout(path: Path) -> str | None:
         return SCENES if any(match and match[2] == "depth" for match in matches) else None
     except OSError:
         return None
+
+
+def is_rgbd_folder(path: Path) -> bool:
+    """True if a folder has one of the layouts."""
+    return detect_layout(path) is not None
 
 
 def list_frames(path: Path) -> Frames:
@@ -244,8 +250,7 @@ class _Grid(NamedTuple):
 def read(path: Path, context: ReadContext) -> Recording:
     """Read a folder of depth images, with the color images and poses that it holds.
 
-    Where at least half of the depth images have a pose, the others are skipped. Recorded poses
-    are rotated so that z is up (see `align_to_gravity`).
+    Where at least half of the depth images have a pose, the others are skipped.
 
     Raises:
         InputError: no depth image can be read.
@@ -254,20 +259,16 @@ def read(path: Path, context: ReadContext) -> Recording:
     overrides = {}
     if options.cameras is not None:
         overrides = cameras.read_camera_file(Path(options.cameras), (DEPTH, COLOR))
-    info = DatasetInfo(path, frames.format, list(frames.warnings))
-    depth = read_depth_camera(frames, overrides, info.warnings)
+    notes = Source(str(path), format=frames.format, warnings=list(frames.warnings))
+    depth = read_depth_camera(frames, overrides, notes.warnings)
     grid = _make_grid(depth, options, options.depth_scale or frames.scale)
     sources = _list_sources(frames, depth, grid)
-    if options.max_range is None:
-        nearest = max(_MAX_DEPTH, options.min_range + 1e-3)
-        context = context._replace(options=replace(options, max_range=nearest))
     may_differ = frames.format == SCENES
     may_differ &= overrides.keys().isdisjoint((COLOR, DEPTH))
-    images = _read_color_images(frames, depth, grid.scale if may_differ else None, info.warnings)
-    recording = build_recording(sources, info, context, images=images)
+    images = _read_color_images(frames, depth, grid.scale if may_differ else None, notes.warnings)
     rows, columns = grid.rays.shape[:2]
-    recording.source["sensors"] = [{"name": DEPTH, "grid": [rows, columns]}]
-    return align_to_gravity(recording)
+    notes.sensors, notes.max_range = [SensorNotes(DEPTH, grid=(rows, columns))], _MAX_DEPTH
+    return build_recording(sources, notes, context, images=images)
 
 
 def _list_sources(frames: Frames, depth: Camera, grid: _Grid) -> list[CloudSource]:

@@ -4,29 +4,72 @@ While a drive lasts the header says `open`, and the files count: the last whole 
 Images of floats (depth in metres) are `.npy` files of float32.
 """
 
-import json
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, FiniteFloat
-from typing_extensions import TypedDict
+from pydantic import Field
 
-from stillmap.core.array_folder import count_rows, open_npy, parse, read_array, read_poses
+from stillmap.core.array_folder import (
+    count_rows,
+    open_npy,
+    parse,
+    read_array,
+    read_poses,
+    read_record,
+    write_arrays,
+)
 from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
-from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io.images import read_image, write_png
-from stillmap.io.notes import prune_notes
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.prepare.options import MAX_POINT_DISTANCE
 
+HEADER = "recording.json"
+FORMAT = "stillmap-recording"
+
 _IMAGES = "images"
+_ARRAYS = (
+    *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
+    *("T_odom_base", "beam_time", "T_recorded_base"),
+)
+_MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
+_Count = Annotated[int, Field(ge=0, lt=1 << 60)]
+_Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
+_Matrix = list[list[float]]
+
+
+@dataclass
+class _CameraHeader:
+    name: str
+    width: _Pixels
+    height: _Pixels
+    K: _Matrix | None
+    model: str
+    distortion: list[float]
+    T_base_camera: _Matrix | None
+
+
+@dataclass
+class _Header:
+    dimension: Literal[2, 3]
+    scans: _Count
+    beams: _Count
+    sensors: _Count
+    odometry: bool = False
+    beam_times: bool = False
+    recorded_poses: bool = False
+    open: bool = False
+    images: _Count | None = None
+    cameras: list[_CameraHeader] = field(default_factory=list)
+    source: Any = None
 
 
 def _write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[str]]:
@@ -63,30 +106,25 @@ def _write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[st
     return {"images": len(kept), "cameras": cameras}, warnings
 
 
-def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
+def _read_images(path: Path, header: _Header) -> Images | None:
     """The images of a recording folder, each read on demand."""
-    if "images" not in header:
+    if header.images is None:
         return None
-    N = header["images"]
-    stamp_ns = np.array(read_array(path / "image_stamp_ns.npy", (N,), np.int64))
-    camera = np.array(read_array(path / "image_camera.npy", (N,), np.int32))
-    try:
-        cameras = tuple(_camera_from_dict(one) for one in header.get("cameras", ()))
-        return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"is damaged: its cameras: {error}", where=str(path)) from error
-
-
-def _camera_from_dict(one: dict[str, Any]) -> Camera:
-    return Camera(
-        name=one["name"],
-        width=one["width"],
-        height=one["height"],
-        K=_matrix(one["K"], 3),
-        model=one["model"],
-        distortion=np.array(one["distortion"], np.float64).reshape(-1),
-        T_base_camera=_matrix(one["T_base_camera"], 4),
+    stamp_ns = np.array(read_array(path / "image_stamp_ns.npy", (header.images,), np.int64))
+    camera = np.array(read_array(path / "image_camera.npy", (header.images,), np.int32))
+    cameras = tuple(
+        Camera(
+            name=noted.name,
+            width=noted.width,
+            height=noted.height,
+            K=_matrix(noted.K, 3),
+            model=noted.model,
+            distortion=np.array(noted.distortion, np.float64),
+            T_base_camera=_matrix(noted.T_base_camera, 4),
+        )
+        for noted in header.cameras
     )
+    return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
 
 
 def _matrix(rows: Any, n: int) -> NDArray[np.float64] | None:
@@ -102,44 +140,6 @@ def _load_image(folder: Path, image: int) -> NDArray[Any]:
     if pixels.dtype != np.float32 or pixels.ndim != 2:
         raise InputError(f"is damaged: {pixels.shape} {pixels.dtype}", where=str(path))
     return np.array(pixels)
-
-
-HEADER = "recording.json"
-FORMAT = "stillmap-recording"
-FORMAT_VERSION = 1
-_Count = Annotated[int, Field(ge=0, lt=1 << 60)]
-_Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
-_Row = list[FiniteFloat]
-
-
-class _CameraHeader(TypedDict):
-    name: str
-    width: _Pixels
-    height: _Pixels
-    K: list[_Row] | None
-    model: str
-    distortion: _Row
-    T_base_camera: list[_Row] | None
-
-
-class _Header(TypedDict):
-    dimension: Literal[2, 3]
-    scans: _Count
-    beams: _Count
-    sensors: _Count
-    odometry: NotRequired[bool]
-    beam_times: NotRequired[bool]
-    recorded_poses: NotRequired[bool]
-    open: NotRequired[bool]
-    images: NotRequired[_Count]
-    cameras: NotRequired[list[_CameraHeader]]
-
-
-_ARRAYS = (
-    *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
-    *("T_odom_base", "beam_time", "T_recorded_base"),
-)
-_MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
@@ -158,11 +158,9 @@ def write_into(recording: Recording, folder: Path) -> None:
     source = recording.source
     if recording.images is not None:
         image_header, warnings = _write_images(recording.images, folder)
-        if warnings:
-            source = {**source, "warnings": [*source.get("warnings", []), *warnings]}
+        source = replace(source, warnings=[*source.warnings, *warnings])
     header = {
         "format": FORMAT,
-        "format_version": FORMAT_VERSION,
         "dimension": recording.dimension,
         "scans": recording.n_scans,
         "beams": recording.n_beams,
@@ -171,13 +169,9 @@ def write_into(recording: Recording, folder: Path) -> None:
         "beam_times": recording.beam_time is not None,
         "recorded_poses": recording.T_recorded_base is not None,
         **image_header,
-        "source": source,
+        "source": source.to_dict(),
     }
-    text = json.dumps(header, indent=1, allow_nan=False)
-    for name in _ARRAYS:
-        if getattr(recording, name) is not None:
-            write_npy(folder / f"{name}.npy", getattr(recording, name))
-    (folder / HEADER).write_text(text + "\n", encoding="utf-8")
+    write_arrays(folder, {name: getattr(recording, name) for name in _ARRAYS}, HEADER, header)
 
 
 def read(path: Path, scratch: Path | None = None) -> Recording:
@@ -188,59 +182,53 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     Raises:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
-    header = _read_header(path / HEADER)
-    grows = bool(header.get("open"))
-    if grows:
-        header |= _count_whole_scans(path, header)
-    T, M, S, D = (header[key] for key in ("scans", "beams", "sensors", "dimension"))
+    header, grows = _read_header(path / HEADER), False
+    if header.open:
+        header, grows = _count_whole_scans(path, header), True
+    T, M, D = header.scans, header.beams, header.dimension
 
-    def read_own(name: str, *shape: int, dtype: type, scratch: Path | None = None) -> NDArray[Any]:
-        return read_array(path / f"{name}.npy", shape, dtype, scratch, grows)
+    def load(name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+        array = read_array(path / f"{name}.npy", shape, dtype, scratch, grows=grows)
+        return np.ascontiguousarray(array)
 
-    def read_own_poses(name: str, count: int) -> NDArray[np.float64]:
-        return read_poses(path / f"{name}.npy", count, D, MAX_TRANSLATION, grows)
+    def load_poses(name: str, count: int) -> NDArray[np.float64]:
+        return read_poses(path / f"{name}.npy", count, D, MAX_TRANSLATION, grows=grows)
 
-    stamp_ns = np.array(read_own("stamp_ns", T, dtype=np.int64))
-    offset = np.array(read_own("offset", T + 1, dtype=np.int64))
+    stamp_ns, offset = load("stamp_ns", (T,), np.int64), load("offset", (T + 1,), np.int64)
+    points, hit = load("points", (M, D), np.float32), load("hit", (M,), np.bool_)
     # np.diff could overflow
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
         raise _damaged_error(path, "stamp_ns", "stamps decrease")
     if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
         raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
-    points = read_own("points", M, D, dtype=np.float32, scratch=scratch)
-    hit = read_own("hit", M, dtype=np.bool_, scratch=scratch)
     _check_points(path, points, hit)
-    optional: dict[str, Any] = {"T_odom_base": None}
-    for key, name in (("odometry", "T_odom_base"), ("recorded_poses", "T_recorded_base")):
-        if header.get(key):
-            optional[name] = read_own_poses(name, T)
-    if header.get("beam_times"):
-        optional["beam_time"] = read_own("beam_time", M, dtype=np.float32, scratch=scratch)
     try:
         return Recording(
-            stamp_ns=stamp_ns,
-            offset=offset,
+            stamp_ns=np.array(stamp_ns),
+            offset=np.array(offset),
             points=points,
             hit=hit,
-            T_base_sensor=read_own_poses("T_base_sensor", S),
-            sensor=np.array(read_own("sensor", T, dtype=np.int32)),
-            source=prune_notes(header.get("source")),
+            T_base_sensor=load_poses("T_base_sensor", header.sensors),
+            sensor=np.array(load("sensor", (T,), np.int32)),
+            T_odom_base=load_poses("T_odom_base", T) if header.odometry else None,
+            source=Source.from_dict(header.source),
+            beam_time=load("beam_time", (M,), np.float32) if header.beam_times else None,
+            T_recorded_base=load_poses("T_recorded_base", T) if header.recorded_poses else None,
             images=_read_images(path, header),
-            **optional,
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _count_whole_scans(path: Path, header: dict[str, Any]) -> dict[str, int]:
-    """Scans and beams of a folder that is still written, or whose writing was interrupted.
+def _count_whole_scans(path: Path, header: _Header) -> _Header:
+    """The header of a folder that is still written, or whose writing was interrupted.
 
     Raises:
         InputError: there is none, or a file is missing.
     """
-    names = ["stamp_ns", "sensor", *(["T_odom_base"] if header.get("odometry") else [])]
+    names = ["stamp_ns", "sensor", *(["T_odom_base"] if header.odometry else [])]
     scans = min(count_rows(path / f"{name}.npy") for name in names)
-    names = ["points", "hit", *(["beam_time"] if header.get("beam_times") else [])]
+    names = ["points", "hit", *(["beam_time"] if header.beam_times else [])]
     beams = min(count_rows(path / f"{name}.npy") for name in names)
     ends = min(count_rows(path / "offset.npy"), scans + 1)
     offset = open_npy(path / "offset.npy", rows=ends)
@@ -249,7 +237,7 @@ def _count_whole_scans(path: Path, header: dict[str, Any]) -> dict[str, int]:
     scans = int(np.searchsorted(offset, beams, side="right")) - 1
     if scans < 1:
         raise InputError("holds no whole scan", where=str(path))
-    return {"scans": scans, "beams": int(offset[scans])}
+    return replace(header, scans=scans, beams=int(offset[scans]))
 
 
 def has_beam_times(path: Path) -> bool:
@@ -258,18 +246,14 @@ def has_beam_times(path: Path) -> bool:
     Raises:
         InputError: its header is missing or damaged.
     """
-    return bool(_read_header(path / HEADER).get("beam_times"))
+    return _read_header(path / HEADER).beam_times
 
 
-def _read_header(path: Path) -> dict[str, Any]:
-    header = read_json(path, _MAX_HEADER)
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
+def _read_header(path: Path) -> _Header:
+    record = read_record(path, max_bytes=_MAX_HEADER)
+    if record.get("format") != FORMAT:
         raise InputError(f"is not the header of a {FORMAT}", where=str(path))
-    if header.get("format_version") != FORMAT_VERSION:
-        what = f"format_version {header.get('format_version')!r} is unknown here"
-        raise InputError(what, where=str(path), hint=f"this version reads {FORMAT_VERSION}")
-    parse(header, _Header, path)
-    return header
+    return parse(record, _Header, path)
 
 
 def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:

@@ -107,23 +107,18 @@ def pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
-    if len(words) != 8:
-        raise InputError(f"has {len(words)} columns, not 8", where=where, hint=_COLUMNS)
     try:
-        row = [float(word) for word in words[1:]]
         # Decimal has 28 digits: a stamp of 19 keeps 9 beyond the nanosecond before it is rounded
         stamp = int(decimal.Decimal(words[0]).scaleb(9).to_integral_value())
-    except (ValueError, decimal.DecimalException, OverflowError) as error:
-        raise InputError("holds a word that is no number", where=where, hint=_COLUMNS) from error
+        row = [float(word) for word in words[1:]]
+    except (ValueError, decimal.DecimalException, OverflowError):
+        stamp, row = 0, []
     # plain Python: NumPy takes ten times as long for so few numbers
-    if not all(map(math.isfinite, row)):
-        raise InputError("holds a number that is not finite", where=where)
-    if max(map(abs, row[:3])) >= MAX_TRANSLATION:
-        raise InputError("has a position a million kilometres away", where=where, hint=_COLUMNS)
-    if abs(stamp) > MAX_STAMP_NS:
-        raise InputError("has a stamp that is no time from 1824 to 2116", where=where)
-    if abs(math.hypot(*row[3:]) - 1) > _UNIT_TOLERANCE:
-        raise InputError("has a quaternion that is not of length one", where=where, hint=_COLUMNS)
+    is_pose = len(row) == 7 and all(map(math.isfinite, row)) and abs(stamp) <= MAX_STAMP_NS
+    is_near = is_pose and max(map(abs, row[:3])) < MAX_TRANSLATION
+    if not is_near or abs(math.hypot(*row[3:]) - 1) > _UNIT_TOLERANCE:
+        hint = f"a line is '{_COLUMNS}' in seconds and metres, its quaternion of length one"
+        raise InputError("is no pose", where=where, hint=hint)
     return stamp, row
 
 

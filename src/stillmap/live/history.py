@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.arrays import GrowingArray
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.stillmap_folder import FORMAT, FORMAT_VERSION, HEADER
+from stillmap.core.source import LaserPose, SensorNotes, Source
+from stillmap.io.stillmap_folder import FORMAT, HEADER
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -215,18 +217,19 @@ class History:
             "odometry": self._has_odometry,
             "beam_times": self._has_times,
             "open": is_open,
-            "source": self._source(),
+            "source": self._source().to_dict(),
         }
         work = self.folder / f".{HEADER}"
         work.write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")
         os.replace(work, self.folder / HEADER)
 
-    def _source(self) -> dict[str, Any]:
-        sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts]
+    def _source(self) -> Source:
+        given = LaserPose(how="given")
+        sensors = [SensorNotes(str(name), extrinsics=given) for name in self._mounts]
         missing = f"the disk was full: of {self._count} scans {self.kept} were kept"
         warnings = [missing] if self.kept < self._count else []
-        path = {} if self.folder is None else {"path": os.path.abspath(self.folder)}
-        return {**path, "format": "live", "sensors": sensors, "warnings": warnings}
+        path = None if self.folder is None else os.path.abspath(self.folder)
+        return Source(path, format="live", sensors=sensors, warnings=warnings)
 
     def move(self, folder: Path) -> None:
         """Move the recording folder.

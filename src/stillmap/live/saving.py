@@ -108,13 +108,13 @@ class Snapshot(ShortRepr):
         for text in warnings:
             _log.warning(text)
         kept_map = self.kept_map if main == 0 else None
-        source = dict(self.recording.source)
-        plain = replace(self.recording, source={**source, "warnings": []})
-        source["warnings"] = [*source["warnings"], *warnings]
+        noted, details = self.recording.source, dict(self.recording.source.details)
+        plain = replace(self.recording, source=replace(noted, warnings=[]))
         if warnings:
-            source["lost_scans"] = int(np.count_nonzero(self.placement.submap))
+            details["lost_scans"] = int(np.count_nonzero(self.placement.submap))
         if kept_map is not None and kept_map.cloud is not None:
-            source[EXTENDS] = True
+            details[EXTENDS] = True
+        source = replace(noted, warnings=[*noted.warnings, *warnings], details=details)
         result, answers = self._build(replace(self.recording, source=source), main, progress)
         submaps = [self._build(plain, number, no_progress) for number in others]
         path = resolve_output(path)

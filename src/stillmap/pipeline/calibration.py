@@ -9,8 +9,9 @@ from stillmap import em, slam
 from stillmap.core import se2
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes
 from stillmap.pipeline.options import Options
-from stillmap.prepare.beam_times import SPIN_KEY, add_beam_times
+from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.lasers import mirror_beams
 from stillmap.prepare.plausibility import interpolate_late_odometry
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
@@ -72,7 +73,7 @@ def time_sweeps(recording: Recording, options: Options) -> tuple[Recording, Opti
         The recording; the options with the direction that was found; and a sentence about it.
     """
     is_open = recording.dimension == 3 and recording.beam_time is None
-    is_open &= SPIN_KEY not in recording.source  # the reader was told that there is none
+    is_open &= recording.source.spin is None  # the reader was told that there is none
     if not is_open or options.read.spin != "auto":
         return recording, options, []
     spin = estimate_spin(recording, options.slam, resolve_threads(options.threads))
@@ -121,14 +122,12 @@ def _given_parameters(recording: Recording, options: Options, laser: int) -> set
     }
     if chosen.upside_down is not None:
         given.add(UPSIDE_DOWN)
-    sensors = recording.source.get("sensors")
-    notes = sensors[laser] if isinstance(sensors, list) and laser < len(sensors) else {}
-    notes = notes if isinstance(notes, dict) else {}
-    extrinsics = notes.get("extrinsics")
-    how = str(extrinsics.get("how")) if isinstance(extrinsics, dict) else ""
+    sensors = recording.source.sensors
+    notes = sensors[laser] if laser < len(sensors) else SensorNotes()
+    how = "" if notes.extrinsics is None else notes.extrinsics.how
     if how.startswith(("TF", "PARAM", "given")):
         given |= {YAW, *POSITION}
-    if how.startswith("TF") or notes.get("upside_down_how") in ("given", "PARAM"):
+    if how.startswith("TF") or notes.upside_down_how in ("given", "PARAM"):
         given.add(UPSIDE_DOWN)
     return given
 

@@ -1,14 +1,13 @@
 """Warnings of a run: what limits the trust in its result, where, and what to do about it."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import advise
-from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.pipeline.estimate import Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps
 from stillmap.pipeline.snapshots import extent
@@ -81,12 +80,9 @@ def find_map_warnings(maps: Maps, recording: Recording, poses: NDArray[np.float6
     ]
 
 
-def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
-    """The reader's warnings; a foreign recording folder may hold anything there."""
-    noted = source.get("warnings")
-    out = [text for text in noted if isinstance(text, str)] if isinstance(noted, list) else []
-    skipped = count_skipped(source)
-    if skipped:
+def _reader_warnings(source: Source) -> list[str]:
+    out = list(source.warnings)
+    if skipped := source.n_skipped:
         out.append(
             f"{_count_scans(skipped)} {'were' if skipped > 1 else 'was'} left out while reading "
             "(`stillmap info` says why)"

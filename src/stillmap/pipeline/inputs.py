@@ -13,8 +13,7 @@ from stillmap import io as formats
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.from_arrays import poses_to_matrices
-from stillmap.io.parts import read_parts
-from stillmap.io.reader import require_plausible
+from stillmap.io.reader import read_parts, require_plausible
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.options import Options
@@ -32,7 +31,7 @@ def read(
 ) -> Recording:
     """Read a recording of any format, to be mapped.
 
-    `stillmap.load` finds it again by the path, which `source["path"]` notes, or those of its parts.
+    `stillmap.load` finds it again by the path, which `source.path` notes, or those of its parts.
 
     Args:
         path: a CARMEN log, a ROS bag, a folder of clouds, ...: see docs/input.md; or the parts of
@@ -55,10 +54,9 @@ def read(
         path = path[0]
     recording = formats.read(Path(path), options, progress=progress, scratch=scratch)
     here = os.fspath(path)
-    original = recording.source.get("path", here)
-    source = {**recording.source, "path": here}
-    if original != here:
-        source["made_from"] = original
+    original = recording.source.path or here
+    made_from = recording.source.made_from if original == here else original
+    source = dataclasses.replace(recording.source, path=here, made_from=made_from)
     return dataclasses.replace(recording, source=source)
 
 
@@ -81,7 +79,7 @@ def read_poses(
     if isinstance(poses, str) and poses == RECORDED:
         if recording.T_recorded_base is None:
             hint = 'poses="FILE.tum" gives them; a file of the name `recording` is ./recording'
-            where = str(recording.source.get("path", "the recording"))
+            where = recording.source.path or "the recording"
             raise InputError("states no poses", where=where, hint=hint)
         return recording.T_recorded_base
     if isinstance(poses, str | os.PathLike):
@@ -99,7 +97,7 @@ def require_mappable(
             that is for 2D alone, or depth images without poses: their narrow view is not
             registered.
     """
-    where = str(recording.source.get("path", "the recording"))
+    where = recording.source.path or "the recording"
     if recording.n_scans == 0:
         raise InputError("holds no scan that can be used", where=where)
     require_plausible(recording, where)
@@ -111,9 +109,7 @@ def require_mappable(
         )
     if recording.dimension == 2 or poses is not None or recording.T_odom_base is not None:
         return
-    from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
-
-    if depth_camera_names(recording.source):
+    if recording.source.has_depth_camera:
         stated = recording.T_recorded_base is not None
         raise InputError(
             "holds depth images, whose poses have to be given",

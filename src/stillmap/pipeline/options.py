@@ -101,9 +101,7 @@ def resolve_options(options: Options, recording: Recording) -> Options:
     scan, and does not deskew.
     """
     if recording.dimension == 3:
-        from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
-
-        is_depth = bool(depth_camera_names(recording.source))
+        is_depth = recording.source.has_depth_camera
         options = resolve_resolution(options, 3, _DEPTH_VOXEL_SIZE if is_depth else _VOXEL_SIZE)
     if options.estimator == "paper":
         slam = dataclasses.replace(options.slam, loop_closure=False, deskew=False)

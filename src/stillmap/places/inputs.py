@@ -138,8 +138,8 @@ def _name_given(given: Recording | Result) -> str:
     if isinstance(given, Result) and given.path is not None:
         return input_stem(given.path)
     recording = given if isinstance(given, Recording) else given.recording
-    path = recording.source.get("path")
-    return input_stem(Path(path)) if isinstance(path, str) and path else "session"
+    path = recording.source.path
+    return input_stem(Path(path)) if path else "session"
 
 
 def _unique(stem: str, names: set[str]) -> str:

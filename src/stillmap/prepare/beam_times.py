@@ -7,12 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording, beam_stamps_ns
+from stillmap.core.source import Spin
 
 Float = NDArray[np.float64]
-
-# in Recording.source: beam times were computed here; rad, azimuth at the stamp where it is known
-SPIN_KEY, STAMP_AZIMUTH_KEY = "spin", "stamp_azimuth"
-DIRECTION_KEY = "spin_direction"  # as the format states it, until beam times are added
 
 _SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0}
 _TURN = 2.0 * math.pi
@@ -24,14 +21,14 @@ _BLOCK = 1 << 16  # beams transformed at once
 def add_beam_times(recording: Recording, direction: str) -> Recording:
     """Add `beam_time` from the azimuth of each point; one revolution lasts from stamp to stamp.
 
-    The stamp is that of the beam at `source["stamp_azimuth"]` (rad), else of the first one, behind.
+    The stamp is that of the beam at `source.stamp_azimuth`, else of the first one, behind.
 
     Args:
         recording: 3D. Returned unchanged, with a warning, where it has beam times or its stamps
             give no rate.
         direction: `clockwise` or `counter-clockwise` seen from above; any other: no change.
     """
-    if direction not in _SIGN or SPIN_KEY in recording.source:
+    if direction not in _SIGN or recording.source.spin is not None:
         return recording
     if recording.beam_time is not None:
         return _with_warning(recording, "read.spin is ignored: beams have times of their own")
@@ -39,20 +36,16 @@ def add_beam_times(recording: Recording, direction: str) -> Recording:
     if not all(rates):
         return _with_warning(recording, "read.spin is ignored: the stamps give no rate of turns")
     per_second = np.array(rates, np.float64)
-    noted = recording.source.get(STAMP_AZIMUTH_KEY)  # a foreign folder may hold anything there
-    stamp_azimuth = float(noted) if isinstance(noted, int | float) else _SPIN_START
+    noted = recording.source.stamp_azimuth
+    stamp_azimuth = _SPIN_START if noted is None else noted
     beam_time = recording.allocate_per_beam(np.float32)
     for t in recording.iter_scans(range(recording.n_scans), beam_time):
         beams = recording.beams_of(t)
         turns = turns_since_stamp(recording.points[beams], direction, stamp_azimuth)
         beam_time[beams] = turns / per_second[recording.sensor[t]]
-    spin = {
-        "direction": direction,
-        "turns_per_second": [round(float(rate), 4) for rate in per_second],
-        "start": _SPIN_START,
-        "stamp": stamp_azimuth,
-    }
-    return replace(recording, beam_time=beam_time, source={**recording.source, SPIN_KEY: spin})
+    rounded = [round(float(rate), 4) for rate in per_second]
+    spin = Spin(direction, rounded, _SPIN_START, stamp_azimuth)
+    return replace(recording, beam_time=beam_time, source=replace(recording.source, spin=spin))
 
 
 def turns_since_stamp(
@@ -76,8 +69,8 @@ def _spin_rate(recording: Recording, sensor: int) -> float | None:
 
 
 def _with_warning(recording: Recording, what: str) -> Recording:
-    warnings = [*recording.source.get("warnings", []), what]
-    return replace(recording, source={**recording.source, "warnings": warnings})
+    source = replace(recording.source, warnings=[*recording.source.warnings, what])
+    return replace(recording, source=source)
 
 
 def assemble_tilting_laser(

@@ -1,8 +1,8 @@
 """Raw scans of planar lasers, and the recording that the range rules make of them."""
 
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,38 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core import arrays, se2
+from stillmap.core import arrays
 from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.prepare import max_range
 from stillmap.prepare.max_range import RangeRule
-from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, LaserOptions, ReadOptions
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 Float = NDArray[np.float64]
 
 SAMPLE = 1 << 22  # readings from which the range rule is inferred
 _BLOCK = 1 << 18  # beams at a time: these fit into the CPU caches
 _MAX_NEAR_SHARE = 0.5  # of readings below the stated minimum, beyond which it is ignored
-
-
-class LaserPose(NamedTuple):
-    """Pose of a laser on the robot in metres and radians, and how it was found."""
-
-    x: float
-    y: float
-    theta: float
-    how: str
-
-    def matrix(self) -> Float:
-        """(3, 3) T_base_sensor."""
-        return se2.matrix(self.x, self.y, self.theta)
-
-    def override(self, given: LaserOptions) -> "LaserPose":
-        """The pose with the values that options give."""
-        if given.pose == (None, None, None):
-            return self
-        x, y, theta = (f if g is None else g for f, g in zip(self[:3], given.pose, strict=True))
-        return LaserPose(x, y, theta, "given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +87,16 @@ class RawLasers:
         T_odom_base: (T, 3, 3) in the order of `scan_order`; None: no odometry.
         source: notes of the reader; `sensors` of each laser.
         record: (T,) in the order of `scan_order`; see Recording.
+        to_3d: of a laser that tilts, whose mounts are (T, 4, 4): end points (M, 3), NaN where
+            the tilt is not known, and warnings.
     """
 
     lasers: list[RawLaser]
     mounts: list[Float]
     T_odom_base: Float | None
-    source: dict[str, Any] = field(default_factory=dict)
+    source: Source
     record: NDArray[np.int64] | None = None
+    to_3d: "Callable[[Beams], tuple[NDArray[np.float32], list[str]]] | None" = None
 
 
 def scan_order(lasers: list[RawLaser]) -> NDArray[np.intp]:
@@ -126,15 +110,15 @@ def unit_vectors(angles: Float) -> Float:
 
 
 def place_beams(raw: RawLasers, options: ReadOptions, scratch: Path | None) -> Recording:
-    """The 2D recording of all lasers, ordered by stamps.
+    """The recording of all lasers, ordered by stamps.
 
     The readings show which of them are hits (`max_range`); `source` keeps the rule of each laser.
     """
-    warnings, notes, rules = list(raw.source.get("warnings", [])), [], []
-    for laser, known in zip(raw.lasers, raw.source["sensors"], strict=True):
+    warnings, notes, rules = list(raw.source.warnings), [], []
+    for laser, known in zip(raw.lasers, raw.source.sensors, strict=True):
         rule, texts = find_range_rule(laser, options)
         warnings += [f"{laser.name}: {text}" if laser.name else text for text in texts]
-        notes.append({**known, "ranges": rule.to_dict()})
+        notes.append(replace(known, ranges=rule))
         rules.append(rule)
     beams = convert_to_beams(raw.lasers, rules, scratch)
     sensors, first = [], 0
@@ -142,17 +126,21 @@ def place_beams(raw: RawLasers, options: ReadOptions, scratch: Path | None) -> R
         own = np.arange(len(laser.stamp_ns)) if len(mount) > 1 else np.zeros(len(laser.stamp_ns))
         sensors.append((first + own).astype(np.int32))
         first += len(mount)
+    points, hit = beams.points, beams.hit
+    if raw.to_3d is not None:
+        points, texts = raw.to_3d(beams)
+        hit, warnings = hit & ~np.isnan(points[:, 0]), warnings + texts
     return Recording(
         stamp_ns=np.concatenate([laser.stamp_ns for laser in raw.lasers])[beams.scan],
         offset=beams.offset,
-        points=beams.points,
-        hit=beams.hit,
+        points=points,
+        hit=hit,
         T_base_sensor=np.concatenate(raw.mounts),
         sensor=np.concatenate(sensors)[beams.scan],
         T_odom_base=raw.T_odom_base,
         beam_time=beams.beam_time,
         record=raw.record,
-        source={**raw.source, "sensors": notes, "warnings": warnings},
+        source=replace(raw.source, sensors=notes, warnings=warnings),
     )
 
 

@@ -5,13 +5,14 @@ maximum range itself (a clipped sensor), as +inf, or as zero. The readings show 
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import advise
+from stillmap.core.source import RangeRule
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 SelfSector = tuple[int, int, float]  # first and last beam, maximum range (m) of self returns
@@ -49,23 +50,6 @@ class MaxRange:
     threshold: float | None
     how: str
     coded: bool
-
-
-@dataclass(frozen=True)
-class RangeRule:
-    """Interpretation of the readings of one laser. Ranges in metres."""
-
-    threshold: float | None
-    threshold_how: str
-    zero_means: Literal["unusable", "max-range"]
-    zero_how: str
-    free_range: float | None  # None: unknown, maximum-range beams are unusable
-    free_how: str
-    min_range: float
-    self_filter: tuple[SelfSector, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "self_filter": [list(sector) for sector in self.self_filter]}
 
 
 def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -> MaxRange:

@@ -48,13 +48,9 @@ def stated_max_range(recording: Recording) -> float | None:
 
     None: nobody does; a code among the readings says nothing about the reach of a laser.
     """
-    rules = [sensor.get("ranges") or {} for sensor in recording.source.get("sensors") or []]
-    stated = [
-        rule["threshold"]
-        for rule in rules
-        if rule.get("threshold") and str(rule.get("threshold_how")).startswith((GIVEN, DECLARED))
-    ]
-    return max(stated, default=None)
+    rules = [sensor.ranges for sensor in recording.source.sensors if sensor.ranges is not None]
+    stated = (r.threshold for r in rules if r.threshold_how.startswith((GIVEN, DECLARED)))
+    return max(filter(None, stated), default=None)
 
 
 def mapped_range(dimension: int, resolution: float, max_range: float | None = None) -> float:

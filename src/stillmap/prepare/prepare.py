@@ -1,6 +1,7 @@
 """From what a reader returns to a recording that can be mapped."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,17 +9,46 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.prepare.beam_times import DIRECTION_KEY, SPIN_KEY, add_beam_times
-from stillmap.prepare.lasers import mirror_beams
+from stillmap.core.source import Spin
+from stillmap.prepare.beam_times import add_beam_times
+from stillmap.prepare.gravity import align_to_gravity
+from stillmap.prepare.lasers import RawLasers, mirror_beams, place_beams
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.self_filter import remove_self_returns
-from stillmap.prepare.time_window import TimeWindow, select_time
+
+_LIMITS = ("min_range", "max_range", "free_range")
+_LASERS = tuple(f"{laser}_{name}" for laser in ("laser", "laser2") for name in LaserOptions._fields)
 
 
-def prepare(recording: Recording, options: ReadOptions) -> Recording:
-    """What follows from all scans: beam times of spinning lidars, no returns from the robot itself.
+def prepare(
+    raw: Recording | RawLasers, options: ReadOptions, scratch: Path | None = None
+) -> Recording:
+    """Hits by what readings mean, z up, beam times of spinning lidars, no returns from the robot.
 
-    In 2D the range rules (`lasers.place_beams`) have seen to that.
+    Raises:
+        InputError: options are for recordings of another dimension, or a laser that is not there.
+    """
+    return complete(interpret(raw, options, scratch), options, scratch)
+
+
+def interpret(raw: Recording | RawLasers, options: ReadOptions, scratch: Path | None) -> Recording:
+    """Which readings are hits, by the range rule of planar lasers or by the limits of ranges; poses
+    of lasers that options give.
+
+    Raises:
+        InputError: a laser pose is given for a 3D recording or a laser that does not exist.
+    """
+    if isinstance(raw, RawLasers):
+        return place_beams(raw, options, scratch)
+    recording = _limit_ranges(raw, options)
+    options.check_laser_count(len(recording.T_base_sensor))
+    for number in range(min(len(recording.T_base_sensor), 2)):
+        recording = _apply_laser_options(recording, number, options.laser(number))
+    return recording
+
+
+def complete(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
+    """What follows from all scans of a recording; nothing in 2D, where the range rule saw to it.
 
     Raises:
         InputError: options are for recordings of another dimension.
@@ -28,66 +58,52 @@ def prepare(recording: Recording, options: ReadOptions) -> Recording:
             name = "cameras" if options.spin in ("auto", "none") else "spin"
             raise InputError(f"read.{name} is for 3D recordings, this one is in 2D")
         return recording
-    stated = recording.source.pop(DIRECTION_KEY, "auto")
+    recording = align_to_gravity(recording)
+    stated = recording.source.spin_direction or "auto"
+    source = replace(recording.source, spin_direction=None)
+    recording = replace(recording, source=source, scratch=scratch)
     recording = add_beam_times(recording, stated if options.spin == "auto" else options.spin)
     if options.spin == "none" and recording.beam_time is None:
-        source = {**recording.source, SPIN_KEY: {"direction": "none"}}
-        recording = replace(recording, source=source)
+        recording = replace(recording, source=replace(source, spin=Spin("none")))
     return remove_self_returns(recording) if options.self_filter else recording
 
 
-def apply_options(recording: Recording, options: ReadOptions) -> Recording:
-    """Apply time and range limits and laser poses; the recording itself where nothing is set.
-
-    Hits nearer than `min_range` become unusable; hits from `max_range` on become maximum-range
-    beams of that length; maximum-range beams are cut to `free_range`; the beams of an upside-down
-    laser are mirrored. `zero_means`, `self_filter` and fields of view do not apply here.
-
-    Raises:
-        InputError: a laser pose is given for a 3D recording or a laser that does not exist, a
-            topic or frame is named, or no scan lies in the time window.
-    """
-    defaults = ReadOptions(zero_means=options.zero_means, self_filter=options.self_filter)
-    if options == defaults:
-        return recording
-    given = {key: value for key, value in vars(options).items() if value != getattr(defaults, key)}
-    of_bags = ("topic", "tilting_topic", "base_frame", "odom_frame")
-    named = next((key for key in of_bags if key in given), None)
-    if named is not None:
-        raise InputError(f"read.{named} is for bags: this recording has no topics and frames")
-    changed = replace(recording, source={**recording.source, "read_options": given})
-    if window := TimeWindow(options):
-        changed = select_time(changed, window)
-    if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
-        changed = _limit_ranges(changed, options)
-    options.check_laser_count(len(recording.T_base_sensor))
-    for number in range(min(len(recording.T_base_sensor), 2)):
-        changed = _apply_laser_options(changed, number, options.laser(number))
-    return changed
-
-
 def _limit_ranges(recording: Recording, options: ReadOptions) -> Recording:
-    points = arrays.copy(recording.points, recording.scratch)
-    hit = arrays.copy(recording.hit, recording.scratch)
+    """Hits nearer than `min_range` become unusable, those from `max_range` on maximum-range beams;
+    these end at `free_range`, or `max_range`. `source.max_range` is the default of a format."""
+    defaults, source = ReadOptions(), replace(recording.source, max_range=None)
+    if options.max_range is None and recording.source.max_range is not None:
+        nearest = max(recording.source.max_range, options.min_range + 1e-3)
+        options = replace(options, max_range=nearest)
+    names = [n for n in (*_LIMITS, *_LASERS) if getattr(options, n) != getattr(defaults, n)]
+    if names:
+        source.read_options = {name: getattr(options, name) for name in names}
+    recording = replace(recording, source=source)
+    if not set(names) & set(_LIMITS):
+        return recording
+    points, hit = (
+        # of a reader that has just made it: nobody else has it
+        array if array.flags.writeable else arrays.copy(array, recording.scratch)
+        for array in (recording.points, recording.hit)
+    )
     for block in arrays.iter_blocks(points, hit):
         _limit_block(points[block], hit[block], options)
     return replace(recording, points=points, hit=hit)
 
 
 def _limit_block(points: NDArray[np.float32], hit: NDArray[np.bool_], options: ReadOptions) -> None:
-    length = np.linalg.norm(points, axis=1)
+    length = np.sqrt(arrays.squared_lengths(points))
     if options.max_range is not None:
-        hit &= ~(length >= np.float32(options.max_range))
-    ends = [v for v in (options.max_range, options.free_range) if v is not None]
-    if ends:
-        too_far = ~hit & (length > np.float32(min(ends)))
-        points[too_far] *= (np.float32(min(ends)) / length[too_far])[:, None]
-    near = hit & (length < np.float32(options.min_range))
+        hit &= ~(length >= options.max_range)
+    end = min(v for v in (options.max_range, options.free_range, np.inf) if v is not None)
+    long = ~hit & (length > end)
+    points[long] *= (end / length[long])[:, None].astype(np.float32)
+    near = hit & (length < options.min_range)
     points[near], hit[near] = np.nan, False
 
 
 def _apply_laser_options(recording: Recording, number: int, laser: LaserOptions) -> Recording:
-    if laser.pose == (None, None, None) and not laser.upside_down:
+    if laser.pose == (None, None, None) and not laser.upside_down and laser.fov is None:
         return recording
     if recording.dimension != 2:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")

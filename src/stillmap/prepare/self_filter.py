@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
+from stillmap.core.source import BodyBox
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -71,7 +72,7 @@ class SelfMask:
 def remove_self_returns(recording: Recording) -> Recording:
     """Mark returns from the robot itself as unusable.
 
-    `source["self_filter"]` lists sensors, counts of beams, and bounding boxes around the sensor
+    `source.self_filter` lists sensors, counts of beams, and bounding boxes around the sensor
     along the robot's axes. Scans may differ in the number and order of beams.
 
     Args:
@@ -90,10 +91,8 @@ def remove_self_returns(recording: Recording) -> Recording:
             removed = beams.start + found[sensor].find_self_returns(points[beams], hit[beams])
             points[removed], hit[removed] = np.nan, False
             counts[sensor] += len(removed)
-    boxes = [
-        {"sensor": k, "beams": counts[k], **_bounding_box(mask.cells)} for k, mask in found.items()
-    ]
-    source = {**recording.source, "self_filter": boxes}
+    boxes = [BodyBox(k, counts[k], *_bounding_box(mask.cells)) for k, mask in found.items()]
+    source = replace(recording.source, self_filter=boxes)
     return replace(recording, points=points, hit=hit, source=source)
 
 
@@ -232,12 +231,12 @@ def _cell_indices(positions: Float, edge: float) -> Index:
     return np.clip(np.floor((positions + BODY_RADIUS) / edge).astype(np.intp), 0, last)
 
 
-def _bounding_box(cells: Bool) -> dict[str, Any]:
-    """Corners of the occupied cells, metres."""
+def _bounding_box(cells: Bool) -> tuple[Any, Any]:
+    """Low and high corner of the occupied cells, metres."""
     index = np.argwhere(cells)
     low = index.min(axis=0) * _CELL - BODY_RADIUS
     high = (index.max(axis=0) + 1) * _CELL - BODY_RADIUS
-    return {"low": np.round(low, 3).tolist(), "high": np.round(high, 3).tolist()}
+    return tuple(np.round(low, 3).tolist()), tuple(np.round(high, 3).tolist())
 
 
 class ScanSample(NamedTuple):

@@ -1,7 +1,6 @@
 """Restriction of a recording to a part of its time: the options `read.start` and `read.end`."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.source import Part
 from stillmap.core.timestamps import format_seconds
 from stillmap.prepare.options import ReadOptions
 
@@ -106,12 +106,14 @@ class TimeWindow:
         hint = f"the recording spans 0 to {span:.2f} s, stamps {first} to {last}"
         raise InputError(f"has no scan {' '.join(wanted)}", where=where, hint=hint)
 
-    def notes(self) -> dict[str, Any]:
-        """The entry `part` of `Recording.source`; empty without limits."""
-        if not self or self.first_ns is None or self.last_ns is None:
-            return {}
-        span = {"first_stamp_ns": self.first_ns, "last_stamp_ns": self.last_ns}
-        return {"part": {"start": self._start, "end": self._end, "omitted": self.omitted, **span}}
+    @property
+    def part(self) -> Part | None:
+        """What was read, as `Recording.source` notes it; None without limits."""
+        if not self or self.first_ns is None:
+            return None
+        return Part(
+            self.first_ns, self.last_ns, omitted=self.omitted, start=self._start, end=self._end
+        )
 
 
 def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Recording:
@@ -125,21 +127,8 @@ def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Re
     scans = np.flatnonzero(inside)
     if not len(scans):
         return recording
-    rows = slice(int(scans[0]), int(scans[-1]) + 1)  # stamps do not decrease
-    beams = slice(int(recording.offset[rows.start]), int(recording.offset[rows.stop]))
     return replace(
-        recording,
-        stamp_ns=recording.stamp_ns[rows],
-        offset=recording.offset[rows.start : rows.stop + 1] - recording.offset[rows.start],
-        points=recording.points[beams],
-        hit=recording.hit[beams],
-        sensor=recording.sensor[rows],
-        T_odom_base=None if recording.T_odom_base is None else recording.T_odom_base[rows],
-        T_recorded_base=(
-            None if recording.T_recorded_base is None else recording.T_recorded_base[rows]
-        ),
-        beam_time=None if recording.beam_time is None else recording.beam_time[beams],
+        recording.slice_scans(int(scans[0]), int(scans[-1]) + 1),  # stamps do not decrease
         images=window.select_images(recording.images),
-        record=None if recording.record is None else recording.record[rows],
-        source={**recording.source, **window.notes()},
+        source=replace(recording.source, part=window.part or recording.source.part),
     )

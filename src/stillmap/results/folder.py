@@ -16,7 +16,7 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
-from stillmap.io.parts import read_parts
+from stillmap.io.reader import read_parts
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration

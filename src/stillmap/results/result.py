@@ -114,7 +114,7 @@ class Result:
             p_static=mapping.p_static,
             hit=recording.hit,
             objects=mapping.objects,
-            sessions=[_only_session(recording.source, recording.stamp_ns, mapping.poses)],
+            sessions=[_only_session(recording.source.path, recording.stamp_ns, mapping.poses)],
             changes=[],
             mapping=mapping,
         )
@@ -301,12 +301,9 @@ class Result:
         return sorted(placed, key=lambda scans: int(scans.start))
 
 
-def _only_session(
-    source: Mapping[str, Any], stamp_ns: NDArray[np.int64], poses: Float
-) -> PlaceSession:
+def _only_session(path: str | None, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
     """The session of a result of one recording, whose frame is the map frame."""
-    path, D = source.get("path"), poses.shape[-1] - 1
-    path = path if isinstance(path, str) and path else None
+    D = poses.shape[-1] - 1
     times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
     return PlaceSession(
         input_stem(Path(path)) if path else "session",
@@ -410,7 +407,9 @@ def load(path: PathLike, *, recording: Source | None = None) -> Result:
     record, labels = read_run(folder), read_labels(folder)
     opened = ResultFolder(folder, record, Path(), recording is not None)
     poses, changes = _read_poses(opened, labels), list[SessionChange]()
-    sessions = [_only_session(record["input"], labels.stamp_ns, poses)]
+    noted = record["input"].get("path")
+    read_from = noted if isinstance(noted, str) and noted else None
+    sessions = [_only_session(read_from, labels.stamp_ns, poses)]
     if has_several:
         sessions = read_sessions(folder)
         changes = read_changes(folder, read_states(folder)[1])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.config import to_dict
 from stillmap.core.files import package_version
-from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.core.json import to_jsonable
 from stillmap.core.tiles import Layer, tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
@@ -36,12 +36,12 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
     counts = {
         "scans": result.recording.n_scans,
         **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-        "skipped": count_skipped(result.recording.source),
+        "skipped": result.recording.source.n_skipped,
     }
     record = {
         "format_version": FORMAT_VERSION,
         "version": package_version(),
-        "input": result.recording.source,
+        "input": result.recording.source.to_dict(),
         "options": to_dict(result.options),
         "iterations": [_iteration(it) for it in result.iterations],
         "converged": result.converged,
@@ -98,12 +98,12 @@ def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
     """The `tilting` entry of `run.json`."""
     counts = count_beams(tilting.deskewed, tilting.p_static)
     return {
-        "input": tilting.recording.source,
+        "input": tilting.recording.source.to_dict(),
         "counts": {
             "scans": tilting.recording.n_scans,
             **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
             "left_out": tilting.unposed_beams,
-            "skipped": count_skipped(tilting.recording.source),
+            "skipped": tilting.recording.source.n_skipped,
         },
         "dynamic": counts["dynamic"],
         "boxes": tilting.boxes_hit,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.source import SensorNotes, Source
 from stillmap.sim.dynamics import Motion, Progress, simulate_motion
 from stillmap.sim.options import OdometryOptions
 from stillmap.sim.scene import Scene
@@ -62,10 +63,10 @@ class Episode:
         """(T,) exact stamps in ns."""
         return _FIRST_STAMP_NS + np.round(self.motion.seconds * 1e9).astype(np.int64)
 
-    def source(self, sensors: list[dict[str, Any]]) -> dict[str, Any]:
+    def source(self, sensors: list[SensorNotes]) -> Source:
         """Metadata of a recording."""
-        name = self.scene.name
-        return {"format": "simulation", "scene": name, "seed": self.seed, "sensors": sensors}
+        details = {"scene": self.scene.name, "seed": self.seed}
+        return Source(format="simulation", sensors=sensors, details=details)
 
     def truth(
         self,

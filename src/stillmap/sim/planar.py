@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes
 from stillmap.sim import laser
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
@@ -94,14 +94,12 @@ def _mounts(o: LaserOptions, pose: tuple[float, float, float]) -> Float:
     return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
 
 
-def _describe_sensors(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
-    about = {
-        "beams_per_scan": len(angles),
-        "start_angle": float(angles[0]),
-        "angle_step": float(angles[1] - angles[0]),
-    }
-    return [{"name": name, **about} for name in ("simulated laser", "simulated rear laser")][
-        : o.count
+def _describe_sensors(o: LaserOptions, angles: Float) -> list[SensorNotes]:
+    first, step = float(angles[0]), float(angles[1] - angles[0])
+    names = ("simulated laser", "simulated rear laser")[: o.count]
+    return [
+        SensorNotes(name, beams_per_scan=len(angles), start_angle=first, angle_step=step)
+        for name in names
     ]
 
 

@@ -10,6 +10,7 @@ from stillmap.core import se2
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes
 from stillmap.sim import lidar
 from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.dynamics import Progress
@@ -185,7 +186,7 @@ def _record(
         T_base_sensor=T_base_sensor[None],
         sensor=np.zeros(T, np.int32),
         T_odom_base=T_odom_base,
-        source=episode.source([{"name": sensor.name}]),
+        source=episode.source([SensorNotes(sensor.name)]),
         beam_time=times.finish() if sensor.takes_time else None,
         scratch=scratch,
     )

@@ -5,6 +5,7 @@ import gzip
 import pytest
 
 from stillmap.core.errors import InputError
+from stillmap.core.source import Skipped
 from stillmap.io import read
 from stillmap.io.carmen.log import BAD_LINE, WRONG_COUNT
 from stillmap.io.carmen.reader import TIME_BACKWARDS
@@ -32,22 +33,22 @@ from stillmap.io.text_lines import MAX_LINE
 def test_a_bad_line_costs_its_scan(read_log, flaser, line):
     recording = read_log([flaser(1.0), line, flaser(3.0)])
     assert recording.n_scans == 2
-    ((reason, damage),) = recording.source["skipped"].items()
+    ((reason, damage),) = recording.source.skipped.items()
     assert reason in (BAD_LINE, WRONG_COUNT)
-    assert damage == {"count": 1, "lines": [2]}
+    assert damage == Skipped(1, [2])
 
 
 def test_another_count_than_most(read_log, flaser):
     recording = read_log([flaser(1.0), flaser(2.0, [1, 2, 3, 4, 5]), flaser(3.0), flaser(4.0)])
     assert recording.n_scans == 3
-    assert recording.source["skipped"] == {WRONG_COUNT: {"count": 1, "lines": [2]}}
+    assert recording.source.skipped == {WRONG_COUNT: Skipped(1, [2])}
 
 
 @pytest.mark.parametrize("stamps", [[1, 2, 3, 900, 4, 5, 5, 6], [1, 2, 3, 0.5, 4, 5]])
 def test_a_stamp_that_jumps_costs_its_scan(read_log, flaser, stamps):
     recording = read_log([flaser(stamp) for stamp in stamps])
     assert (recording.stamp_ns / 1e9).tolist() == stamps[:3] + stamps[4:]
-    assert recording.source["skipped"][TIME_BACKWARDS]["lines"] == [4]
+    assert recording.source.skipped[TIME_BACKWARDS].lines == [4]
 
 
 def test_cut_last_line_is_skipped(read_log, flaser):
@@ -56,7 +57,7 @@ def test_cut_last_line_is_skipped(read_log, flaser):
     for length in range(1, len(last) - len("0.5") + 1):
         recording = read_log(whole + last[:length])
         assert recording.n_scans == 1, last[:length]
-        assert recording.source["skipped"][BAD_LINE]["lines"] == [2], last[:length]
+        assert recording.source.skipped[BAD_LINE].lines == [2], last[:length]
     assert read_log(whole + last).n_scans == 2
 
 
@@ -65,22 +66,22 @@ def test_damaged_gzip_stream(log, flaser):
     packed = gzip.compress("\n".join(lines).encode())
     recording = read(log(packed[: len(packed) // 2], "cut.log.gz"))
     assert 50 < recording.n_scans < 350
-    assert recording.source["skipped"][BAD_LINE]["lines"] == [recording.n_scans + 1]
+    assert recording.source.skipped[BAD_LINE].lines == [recording.n_scans + 1]
 
 
 def test_damaged_odometry(read_log, flaser):
     recording = read_log(
         ["ODOM 1 2 nan 0 0 0 1 h 0", "ODOM 1 2", "ODOM 0 0 0 0 0 0 x h 0", flaser(1.0)]
     )
-    assert recording.source["skipped"] == {}
-    assert recording.source["skipped_odometry"] == {BAD_LINE: {"count": 3, "lines": [1, 2, 3]}}
+    assert recording.source.skipped == {}
+    assert recording.source.skipped_odometry == {BAD_LINE: Skipped(3, [1, 2, 3])}
 
 
 def test_line_numbers_are_kept_up_to_a_thousand(read_log, flaser):
     recording = read_log([flaser(1.0), *["FLASER 3 1 2"] * 1500])
-    damage = recording.source["skipped"][BAD_LINE]
-    assert damage == {"count": 1500, "lines": list(range(2, 1002))}
-    assert any("1500 of 1501" in warning for warning in recording.source["warnings"])
+    damage = recording.source.skipped[BAD_LINE]
+    assert damage == Skipped(1500, list(range(2, 1002)))
+    assert any("1500 of 1501" in warning for warning in recording.source.warnings)
 
 
 def test_log_of_damaged_scans_only(read_log):

@@ -25,14 +25,14 @@ def mirrored(recording):
 def test_upside_down_by_params(read_log, flaser, place, kind):
     line = flaser(1.0, kind=kind)
     upright = read_log([line])
-    assert not upright.source["sensors"][0]["upside_down"]
+    assert not upright.source.sensors[0].upside_down
     for value, flips in (("1", True), ("0", False)):
         recording = read_log([f"PARAM robot_{place}laser_flipped {value} host 0", line])
         expected = mirrored(upright) if flips else upright.points
         np.testing.assert_allclose(recording.points, expected, atol=1e-6)
         np.testing.assert_allclose(recording.T_base_sensor, upright.T_base_sensor)
-        noted = recording.source["sensors"][0]
-        assert (noted["upside_down"], noted["upside_down_how"]) == (flips, "PARAM")
+        noted = recording.source.sensors[0]
+        assert (noted.upside_down, noted.upside_down_how) == (flips, "PARAM")
     assert np.abs(upright.points[:, 1]).max() > 0.5
 
 
@@ -48,7 +48,7 @@ def test_options_override_params(read_log, flaser):
     lines = ["PARAM robot_frontlaser_flipped 1", flaser(1.0)]
     recording = read_log(lines, laser_upside_down=False)
     np.testing.assert_array_equal(recording.points, read_log(lines[1:]).points)
-    assert recording.source["sensors"][0]["upside_down_how"] == "given"
+    assert recording.source.sensors[0].upside_down_how == "given"
     recording = read_log(lines[1:], laser_upside_down=True)
     np.testing.assert_allclose(recording.points, mirrored(read_log(lines[1:])), atol=1e-6)
 
@@ -74,8 +74,8 @@ def test_fields_of_view(read_log, flaser, n, fov, last, step):
         found = np.degrees(np.unwrap(angles(recording)))
         np.testing.assert_allclose(found, -fov / 2 + step * np.arange(n), atol=1e-3)
         assert found[-1] == pytest.approx(last, abs=1e-3)
-    noted = given.source["sensors"][0]
-    assert math.degrees(noted["angle_step"]) == pytest.approx(step)
+    noted = given.source.sensors[0]
+    assert math.degrees(noted.angle_step) == pytest.approx(step)
 
 
 def test_the_second_laser(read_log, flaser):
@@ -86,6 +86,6 @@ def test_the_second_laser(read_log, flaser):
     np.testing.assert_allclose(x, [[0, 0, 0], [-0.3, 0.1, 3.0]], atol=1e-12)
     np.testing.assert_array_equal(angles(recording, 0), angles(plain, 0))
     np.testing.assert_allclose(angles(recording, 1), [0.5, 0.25, 0, -0.25], atol=1e-6)
-    assert [s["upside_down"] for s in recording.source["sensors"]] == [False, True]
+    assert [s.upside_down for s in recording.source.sensors] == [False, True]
     with pytest.raises(InputError, match="laser2_"):
         read_log(lines[:1], **options)

@@ -31,8 +31,8 @@ def test_flaser_with_known_numbers(read_log):
     assert recording.T_odom_base is not None
     np.testing.assert_allclose(se2.parameters(recording.T_odom_base), [[0, 0, 0], [1, 2, 0.5]])
     np.testing.assert_array_equal(recording.T_base_sensor, np.eye(3)[None])
-    assert recording.source["odometry"]["from"] == "scan lines"
-    assert recording.source["ignored"] == {"comments": 1}
+    assert recording.source.odometry["from"] == "scan lines"
+    assert recording.source.ignored == {"comments": 1}
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_front_and_rear_laser(read_log, flaser):
     assert (x, y, abs(theta)) == (0.0, 0.0, pytest.approx(math.pi))
     rear_last = recording.points[recording.beams_of(3)]
     np.testing.assert_allclose(np.linalg.norm(rear_last, axis=1), [7.0, 8.0], rtol=1e-6)
-    assert recording.source["skipped"]["time running backwards"]["count"] == 1
+    assert recording.source.skipped["time running backwards"].count == 1
 
 
 def test_rawlaser_interpolates_odometry(read_log):
@@ -80,7 +80,7 @@ def test_rawlaser_interpolates_odometry(read_log):
     # a quarter of the way; the heading turns 0.2 rad over the cut at pi, not back around
     np.testing.assert_allclose(poses[0], [1.0, 0.5, math.pi - 0.05], atol=1e-12)
     np.testing.assert_allclose(poses[1], [4.0, 2.0, -math.pi + 0.1], atol=1e-12)
-    assert recording.source["odometry"]["outside"] == 1
+    assert recording.source.odometry["outside"] == 1
     np.testing.assert_allclose(recording.points[:3], [[0, -1], [2, 0], [0, 3]], atol=1e-6)
     assert recording.hit.tolist() == [True] * 5 + [False], "the declared 20 m is maximum range"
 
@@ -94,7 +94,7 @@ def test_robotlaser_offset_from_its_two_poses(read_log):
         lines.append(f"ROBOTLASER1 {HEADER} 2 1.0 2.0 1 9 {fields} 0.1 0.2 0.3 0.4 0.5 {i} h 0.1")
     recording = read_log(lines)
     np.testing.assert_allclose(recording.T_base_sensor[0], T_base_sensor, atol=1e-5)
-    assert recording.source["sensors"][0]["extrinsics"]["how"] == "scan lines"
+    assert recording.source.sensors[0].extrinsics.how == "scan lines"
     assert se2.parameters(recording.T_odom_base)[1] == pytest.approx((1, 2, 1.5))
 
 
@@ -113,7 +113,7 @@ def test_laser_facing_backwards_with_noise(read_log, flaser):
     x, y, theta = se2.parameters(recording.T_base_sensor[0])
     assert (x, y) == (pytest.approx(-0.2), pytest.approx(0.0))
     assert abs(theta) == pytest.approx(math.pi, abs=2e-3)
-    assert recording.source["sensors"][0]["extrinsics"]["how"] == "scan lines"
+    assert recording.source.sensors[0].extrinsics.how == "scan lines"
 
 
 def test_corrected_laser_poses_are_ignored(read_log, flaser):
@@ -124,7 +124,7 @@ def test_corrected_laser_poses_are_ignored(read_log, flaser):
     ]
     recording = read_log(lines)
     np.testing.assert_array_equal(recording.T_base_sensor[0], np.eye(3))
-    assert any("corrected log" in warning for warning in recording.source["warnings"])
+    assert any("corrected log" in warning for warning in recording.source.warnings)
 
 
 def test_params_give_the_offset_and_options_override_it(read_log, flaser):
@@ -135,17 +135,17 @@ def test_params_give_the_offset_and_options_override_it(read_log, flaser):
     ]
     recording = read_log(lines)
     np.testing.assert_allclose(se2.parameters(recording.T_base_sensor[0]), [0.25, 0.05, 0.0])
-    assert recording.source["params"]["robot_frontlaser_offset"] == "0.25"
+    assert recording.source.params["robot_frontlaser_offset"] == "0.25"
     overridden = read_log(lines, laser_theta=0.5)
     np.testing.assert_allclose(se2.parameters(overridden.T_base_sensor[0]), [0.25, 0.05, 0.5])
-    assert overridden.source["sensors"][0]["extrinsics"]["how"] == "given"
+    assert overridden.source.sensors[0].extrinsics.how == "given"
 
 
 def test_param_declares_maximum_range(read_log, flaser):
     lines = ["PARAM robot_front_laser_max 3.0 host 0", flaser(1.0, [1.0, 2.999, 3.0, 4.0])]
     recording = read_log(lines)
     assert recording.hit.tolist() == [True, True, False, False]
-    assert recording.source["sensors"][0]["ranges"]["threshold"] == 3.0
+    assert recording.source.sensors[0].ranges.threshold == 3.0
 
 
 def test_duplicate_lines_are_dropped(read_log):
@@ -158,17 +158,17 @@ def test_duplicate_lines_are_dropped(read_log):
             f"RAWLASER1 {HEADER} 3 1.0 2.0 0 1.0 host 0.1",  # damaged, but not used either
         ]
     )
-    assert [s["name"] for s in recording.source["sensors"]] == ["RAWLASER2", "ROBOTLASER1"]
+    assert [s.name for s in recording.source.sensors] == ["RAWLASER2", "ROBOTLASER1"]
     assert recording.n_scans == 2
-    assert "RAWLASER1: 1 scans not used" in recording.source["duplicates"][0]
-    assert recording.source["skipped"] == {}
+    assert "RAWLASER1: 1 scans not used" in recording.source.duplicates[0]
+    assert recording.source.skipped == {}
 
 
 def test_angles_that_contradict_the_field_of_view(read_log):
     header = "0 -1.57 3.14 0.00872 20.0 0.01 0"
     ranges = " ".join(["1.0"] * 180)
     recording = read_log([f"RAWLASER1 {header} 180 {ranges} 0 1.0 host 0.1"])
-    assert any("field of view" in warning for warning in recording.source["warnings"])
+    assert any("field of view" in warning for warning in recording.source.warnings)
 
 
 def test_constant_scan_poses_are_ignored(read_log, flaser):
@@ -176,7 +176,7 @@ def test_constant_scan_poses_are_ignored(read_log, flaser):
         ["ODOM 1 0 0 0 0 0 1.0 host 0", flaser(1.5), flaser(2.0), "ODOM 3 0 0 0 0 0 2.0 host 0"]
     )
     np.testing.assert_allclose(se2.parameters(recording.T_odom_base)[:, 0], [2.0, 3.0])
-    assert recording.source["odometry"]["from"] == "ODOM lines"
+    assert recording.source.odometry["from"] == "ODOM lines"
 
 
 def test_old_and_new_number_formats(read_log):
@@ -191,7 +191,7 @@ def test_old_and_new_number_formats(read_log):
     assert np.isnan(recording.points[4]).all()
     assert recording.hit.tolist() == [True] * 4 + [False] * 2
     assert np.isfinite(recording.points[5]).all(), "+inf is maximum range"
-    assert recording.source["skipped"] == {}
+    assert recording.source.skipped == {}
 
 
 def test_host_may_be_a_number(read_log):
@@ -206,14 +206,14 @@ def test_gzip_is_detected_by_content(log, flaser):
     unpacked = read(log(text, "unpacked.clf.gz"))
     np.testing.assert_array_equal(plain.points, packed.points)
     np.testing.assert_array_equal(plain.points, unpacked.points)
-    assert packed.source["gzip"]
-    assert not unpacked.source["gzip"]
+    assert packed.source.details["gzip"]
+    assert not unpacked.source.details["gzip"]
 
 
 def test_unknown_kinds_are_counted(read_log, flaser):
     recording = read_log(["SYNC now", "SONAR 1 2 3", "SONAR 3", "", flaser(1.0)])
-    assert recording.source["ignored"] == {"SYNC": 1, "SONAR": 2}
-    assert recording.source["skipped"] == {}
+    assert recording.source.ignored == {"SYNC": 1, "SONAR": 2}
+    assert recording.source.skipped == {}
 
 
 @pytest.mark.parametrize("kind", ["RAWLASER1", "ROBOTLASER1"])

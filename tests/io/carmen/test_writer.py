@@ -21,8 +21,8 @@ def again(recording, path):
     """Write and read a recording; check what holds for every kind of line."""
     writers.write(recording, path)
     found = read(path)
-    assert found.source["skipped"] == found.source["skipped_odometry"] == {}
-    assert found.source["warnings"] == []
+    assert found.source.skipped == found.source.skipped_odometry == {}
+    assert found.source.warnings == []
     np.testing.assert_array_equal(found.stamp_ns, recording.stamp_ns)
     np.testing.assert_array_equal(found.offset, recording.offset)
     np.testing.assert_array_equal(found.sensor, recording.sensor)
@@ -40,7 +40,7 @@ def again(recording, path):
 
 
 def kinds(recording):
-    return [one["name"] for one in recording.source["sensors"]]
+    return [one.name for one in recording.source.sensors]
 
 
 @pytest.mark.parametrize("beams", [180, 361])
@@ -76,7 +76,7 @@ def test_clockwise_beams(tmp_path, fov, odometry):
     recording = simulated(fov=np.radians(fov), upside_down="known", x=0.2)
     recording = recording if odometry else recording.without_odometry()
     found = again(recording, tmp_path / "a.log")
-    assert found.source["sensors"][0]["upside_down"]
+    assert found.source.sensors[0].upside_down
 
 
 @pytest.mark.parametrize("share", [0.002, 0.3])

@@ -13,7 +13,7 @@ from small_bags import Messages, write_bag
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.ros import lasers, limits
-from stillmap.io.ros.messages import TIME_BACKWARDS
+from stillmap.io.ros.messages import TIME_BACKWARDS, UNREADABLE
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -29,7 +29,7 @@ def scans_of(messages, n, **changes):
 
 
 def skipped(recording):
-    return {reason: one["count"] for reason, one in recording.source["skipped"].items()}
+    return {reason: one.count for reason, one in recording.source.skipped.items()}
 
 
 def file_of(path: Path) -> Path:
@@ -50,7 +50,7 @@ def test_cut(bag, messages, kind, share):
         return
     assert recording.n_scans > 0.7 * share * 200 - 3
     if kind in ("bag", "mcap"):
-        assert "cut or damaged" in recording.source["warnings"][0]
+        assert "cut or damaged" in recording.source.warnings[0]
     # the recovered scans are unchanged
     got = np.linalg.norm(recording.points, axis=1).reshape(-1, 400)[:, 0]
     k = (recording.stamp_ns - START) // (SECOND // 10)
@@ -88,8 +88,8 @@ def test_wrong_array_lengths(bag, messages):
     content[5] = (*content[5][:2], (kind, raw[:50]))
     recording = read(bag(content))
     assert recording.n_scans == 2
-    assert skipped(recording) == {lasers.UNREADABLE: 4}
-    assert recording.source["skipped"][lasers.UNREADABLE]["lines"] == [2, 4, 5, 6]
+    assert skipped(recording) == {UNREADABLE: 4}
+    assert recording.source.skipped[UNREADABLE].lines == [2, 4, 5, 6]
 
 
 def test_numbers_of_beams_may_vary(bag, messages):
@@ -120,7 +120,7 @@ def test_headers_without_stamps(bag, messages):
     ]
     recording = read(bag(content))
     np.testing.assert_array_equal(recording.stamp_ns, START + np.arange(3) * SECOND)
-    assert "log times are used" in recording.source["warnings"][0]
+    assert "log times are used" in recording.source.warnings[0]
 
 
 def test_invalid_transforms(bag, messages):
@@ -134,7 +134,7 @@ def test_invalid_transforms(bag, messages):
     content.append(("/tf", START, messages.tf(*bad)))
     recording = read(bag(content))
     assert recording.T_odom_base is None
-    assert recording.source["skipped_odometry"]["transform that is none"]["count"] == 4
+    assert recording.source.skipped_odometry["transform that is none"].count == 4
 
 
 @pytest.mark.parametrize("packing", ["bz2", "lz4"])

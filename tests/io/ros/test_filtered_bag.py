@@ -78,7 +78,7 @@ def test_the_no_return_code_of_the_laser_is_used(bag, messages, tmp_path, zeros)
     got = np.concatenate([m.ranges for _, _, m in contents(out, messages)])
     assert (got[blank] == (0.0 if zeros else np.inf)).all()
     again = read(out)
-    rules = [one.source["sensors"][0]["ranges"]["zero_means"] for one in (recording, again)]
+    rules = [one.source.sensors[0].ranges.zero_means for one in (recording, again)]
     assert rules == ["max-range" if zeros else "unusable"] * 2
     np.testing.assert_array_equal(again.hit, recording.hit & ~blank)
     assert np.isfinite(again.points).all()

@@ -58,7 +58,7 @@ def test_invalid_poses(bag, messages, place):
     recording = read(bag(content))
     assert np.isfinite(recording.T_base_sensor).all()
     assert np.isfinite(recording.T_odom_base).all()
-    assert recording.source["skipped_odometry"]["transform that is none"]["count"] == 5
+    assert recording.source.skipped_odometry["transform that is none"].count == 5
 
 
 def test_values_of_other_types(db3):
@@ -95,7 +95,7 @@ def test_tree_with_a_shared_page(db3, monkeypatch):
     struct.pack_into(">I", content, 28, len(content) // size)
     path.write_bytes(content)
     recording = read(path)
-    assert recording.source["damage"]["rows that cannot be read"]["count"] == 1
+    assert recording.source.damage["rows that cannot be read"].count == 1
     assert recording.n_scans <= 3  # the others repeat stamps and readings
 
 

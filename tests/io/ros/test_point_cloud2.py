@@ -93,7 +93,7 @@ def test_damaged_clouds_are_counted(bag, messages, rng):
     ]
     recording = read(bag(content))
     assert recording.n_scans == 1
-    found = {reason: one["count"] for reason, one in recording.source["skipped"].items()}
+    found = {reason: one.count for reason, one in recording.source.skipped.items()}
     assert found == {cloud_module.WRONG_SIZE: 5, cloud_module.NO_COORDINATES: 1}
 
 

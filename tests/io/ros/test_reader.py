@@ -54,9 +54,9 @@ def test_a_drive(bag, messages):
     angle = np.arctan2(recording.points[:, 1], recording.points[:, 0]).reshape(10, 5)
     np.testing.assert_allclose(angle, np.tile([-0.5, -0.25, 0, 0.25, 0.5], (10, 1)), atol=1e-6)
     assert recording.hit.all()
-    assert recording.source["odometry"]["from"] == "TF from odom to base_link"
-    assert recording.source["base_frame"] == "base_link"
-    assert not recording.source["warnings"]
+    assert recording.source.odometry["from"] == "TF from odom to base_link"
+    assert recording.source.base_frame == "base_link"
+    assert not recording.source.warnings
 
 
 def test_no_transforms(bag, messages):
@@ -64,7 +64,7 @@ def test_no_transforms(bag, messages):
     recording = read(bag(scans))
     assert recording.T_odom_base is None
     np.testing.assert_array_equal(recording.T_base_sensor[0], np.eye(3))
-    assert "is used as the base frame" in recording.source["warnings"][0]
+    assert "is used as the base frame" in recording.source.warnings[0]
 
 
 def test_odometry_messages(bag, messages):
@@ -81,8 +81,8 @@ def test_odometry_messages(bag, messages):
     np.testing.assert_allclose(
         np.stack([x, y, theta]), [[0, 1, 2, 3], [0, 2, 4, 6], 0.1 * np.arange(4)]
     )
-    assert recording.source["odometry"]["from"] == "/odom"
-    assert recording.source["base_frame_how"] == "/odom names it"
+    assert recording.source.odometry["from"] == "/odom"
+    assert recording.source.base_frame_how == "/odom names it"
 
 
 def test_infinity_means_no_return(bag, messages):
@@ -119,7 +119,7 @@ def test_upside_down_laser(bag, messages):
     )
     angle = np.arctan2(recording.points[:5, 1], recording.points[:5, 0])
     np.testing.assert_allclose(angle, [0.5, 0.25, 0, -0.25, -0.5], atol=1e-6)
-    assert recording.source["sensors"][0]["upside_down"]
+    assert recording.source.sensors[0].upside_down
 
 
 def test_two_lasers_interleave(bag, messages):
@@ -158,7 +158,7 @@ def test_unconnected_lasers(bag, messages):
         content.append(("/b", stamp, messages.scan(stamp, ranges_at(k), "other")))
     recording = read(bag(content))
     assert recording.n_scans == 6
-    assert "no transform connects 'other'" in recording.source["duplicates"][0]
+    assert "no transform connects 'other'" in recording.source.duplicates[0]
 
 
 def test_duplicate_topics_are_dropped(bag, messages):
@@ -168,10 +168,8 @@ def test_duplicate_topics_are_dropped(bag, messages):
         content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
         content.append(("/scan_filtered", stamp, messages.scan(stamp, ranges_at(k))))
     recording = read(bag(content))
-    assert [s["name"] for s in recording.source["sensors"]] == ["/scan"]
-    assert recording.source["duplicates"] == [
-        "/scan_filtered: 6 scans, /scan shows the same sensor"
-    ]
+    assert [s.name for s in recording.source.sensors] == ["/scan"]
+    assert recording.source.duplicates == ["/scan_filtered: 6 scans, /scan shows the same sensor"]
 
 
 def test_moving_laser(bag, messages):
@@ -183,7 +181,7 @@ def test_moving_laser(bag, messages):
         content.append(("/tf", stamp, messages.tf(mount, move)))
         content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
     recording = read(bag(content))
-    assert recording.source["base_frame"] == "base_link"
+    assert recording.source.base_frame == "base_link"
     places = se2.parameters(recording.T_base_sensor)[recording.sensor]
     np.testing.assert_allclose(places[:, 2], 0.1 * np.arange(5), atol=1e-9)
     np.testing.assert_allclose(se2.parameters(recording.T_odom_base)[:, 0], np.arange(5))

@@ -49,6 +49,6 @@ def test_a_split_bag_is_the_whole_one(bag, messages):
     ]
     joined = inputs.read(paths[::-1])
     require_equal(joined, whole)
-    assert joined.source["base_frame"] == "base_link"
-    assert [one["scans"] for one in joined.source["parts"]] == [15, 11, 14]
-    assert joined.source["warnings"] == whole.source["warnings"]
+    assert joined.source.base_frame == "base_link"
+    assert [one.scans for one in joined.source.parts] == [15, 11, 14]
+    assert joined.source.warnings == whole.source.warnings

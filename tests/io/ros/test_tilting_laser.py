@@ -14,6 +14,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.reader import read_parts
 from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.prepare import interpret
 from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.sim.laser import compute_beam_angles
 from stillmap.sim.lidar import compute_joint_angle
@@ -87,8 +88,8 @@ def bag_of(folder, rig, joint_ns=None, kind="mcap"):
     return write_bag(folder, kind, messages, sorted(content, key=lambda one: one[1]), "rig")
 
 
-def read_tilting(path, context):
-    return read_parts([path], context, tilting=True)
+def read_tilting(context, *paths):
+    return interpret(read_parts(paths, context, tilting=True), context.options, None)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,7 @@ def in_base(recording):
 
 
 def test_points_follow_the_joint(rig, path):
-    found, true = read_tilting(path, TILT), rig.tilting.recording
+    found, true = read_tilting(TILT, path), rig.tilting.recording
     assert found.dimension == 3
     np.testing.assert_array_equal(found.stamp_ns, true.stamp_ns)
     np.testing.assert_array_equal(found.hit, true.hit)
@@ -127,7 +128,7 @@ def test_a_bag_in_parts(path, tmp_path):
         write_bag(tmp_path, "mcap", messages, part, name)
         for name, part in (("a", content[:half]), ("b", content[half:]))
     ]
-    found, wanted = read_parts(parts, TILT, tilting=True), read_tilting(path, TILT)
+    found, wanted = read_tilting(TILT, *parts), read_tilting(TILT, path)
     np.testing.assert_array_equal(found.stamp_ns, wanted.stamp_ns)
     np.testing.assert_array_equal(found.points, wanted.points)
     np.testing.assert_array_equal(found.T_base_sensor, wanted.T_base_sensor)
@@ -139,12 +140,12 @@ def test_beams_without_transforms_are_unusable(rig, tmp_path):
     joint_ns = np.arange(first, last, JOINT_NS)
     after = (joint_ns - first) / 1e9
     joint_ns = joint_ns[(after >= 1.0) & ((after <= 3.0) | (after >= 5.0))]
-    found = read_tilting(bag_of(tmp_path, rig, joint_ns), TILT)
+    found = read_tilting(TILT, bag_of(tmp_path, rig, joint_ns))
     taken = (stamps.repeat(91) - first) / 1e9 + found.beam_time
     known = (taken >= 1.0) & ((taken <= 3.0) | (taken >= 5.0))
     np.testing.assert_array_equal(found.hit, rig.tilting.recording.hit & known)
     assert np.isnan(found.points[~known]).all()
-    assert any("do not say how the laser is tilted" in w for w in found.source["warnings"])
+    assert any("do not say how the laser is tilted" in w for w in found.source.warnings)
 
 
 def test_map_command(rig, path, tmp_path):
@@ -168,6 +169,6 @@ def test_map_command(rig, path, tmp_path):
 def test_point_clouds_instead_of_scans(rig, tmp_path):
     writers.write(rig.tilting.recording, tmp_path / "a.mcap")
     wanted = ReadContext(ReadOptions(topic="/points", base_frame="base_link"))
-    found = read_tilting(tmp_path / "a.mcap", wanted)
+    found = read_tilting(wanted, tmp_path / "a.mcap")
     hit = rig.tilting.recording.hit
     np.testing.assert_array_equal(found.points[hit], rig.tilting.recording.points[hit])

@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from stillmap.core.errors import InputError
 from stillmap.core.timestamps import parse_ns
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
@@ -44,7 +43,6 @@ WITHOUT_ANGLES = ("FLASER", "RLASER")
 _HEADER_FIELDS = 7
 _MAX_POSE = 1e7  # m or rad, far beyond any odometry
 _COMMENT = (b"#", b"//")
-_MAX_UNKNOWN_LINES = 5_000_000  # in a row; one in ten lines of a log is a scan or a pose
 _MAX_UNKNOWN_KINDS = 50  # counted one by one; a text that is no log has thousands
 
 
@@ -114,11 +112,10 @@ def _parse_odometry(fields: list[bytes]) -> ScanLine:
 
 
 def _parse_count(fields: list[bytes], at: int, least: int = 1) -> int:
-    if len(fields) <= at or not fields[at].isdigit() or len(fields[at]) > 9:
+    digits = fields[at] if at < len(fields) else b""
+    if not digits.isdigit() or len(digits) > 9 or int(digits) < least:
         raise ValueError(BAD_LINE)
-    if int(fields[at]) < least:
-        raise ValueError(BAD_LINE)
-    return int(fields[at])
+    return int(digits)
 
 
 def _is_stamp(fields: list[bytes]) -> bool:
@@ -264,22 +261,16 @@ def read_log(
         window: selects the scans; None: all.
 
     Raises:
-        InputError: a file cannot be read, has millions of lines in a row without a record, or no
-            scan in the window.
+        InputError: a file cannot be read, or has no scan in the window.
     """
     window = window or TimeWindow(ReadOptions())
     log = CarmenLog(window)
     for number, path in enumerate(paths):
-        first, known = log.n_lines, log.records.total()
+        first = log.n_lines
         for line in read_lines(path, share_progress(progress, number, len(paths))):
             if line.number == 1:
                 line = line._replace(text=line.text.removeprefix(BYTE_ORDER_MARK))
             log.add(line._replace(number=first + line.number))
-            if line.number % _MAX_UNKNOWN_LINES == 0:
-                before, known = known, log.records.total()
-                if known == before:
-                    what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
-                    raise InputError(what, where=f"{path}:{line.number}")
     window.require_scans(str(paths[0]))
     return log
 

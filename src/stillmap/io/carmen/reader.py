@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError, advise
-from stillmap.core.recording import Recording
+from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory
 from stillmap.io.builder import ReadContext
@@ -26,14 +26,7 @@ from stillmap.io.carmen.log import (
     read_log,
 )
 from stillmap.io.text_lines import Line, is_gzip, read_head
-from stillmap.prepare.lasers import (
-    LaserPose,
-    RawLaser,
-    RawLasers,
-    place_beams,
-    scan_order,
-    unit_vectors,
-)
+from stillmap.prepare.lasers import RawLaser, RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
@@ -49,7 +42,7 @@ _MAX_OFFSET = 3.0  # m on a robot
 _MIN_OFFSET = 0.002  # m or rad: less is rounding
 
 
-def read(path: Path, context: ReadContext) -> Recording:
+def read(path: Path, context: ReadContext) -> RawLasers:
     """Read a CARMEN log; see `read_parts`."""
     return read_parts([path], context)
 
@@ -58,10 +51,10 @@ def read_parts(
     paths: Sequence[Path],
     context: ReadContext,
     others: Sequence[Path] = (),
-) -> Recording:
+) -> RawLasers:
     """Read the parts of a CARMEN log, in order of time, as one.
 
-    Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, with
+    Bad records are counted in `source.skipped` (scans) and `source.skipped_odometry`, with
     line numbers, which count through all parts. PARAM lines are in the first part alone: without
     any, those of one of the `others` count.
 
@@ -78,14 +71,11 @@ def read_parts(
     if not scans:
         raise _no_scan_error(paths[0], log)
     raw = _describe_lasers(scans, log, context.options)
-    raw.source.update(
-        path=str(paths[0]),
-        format="carmen",
-        gzip=is_gzip(paths[0]),
-        duplicates=duplicates,
-        **window.notes(),
-    )
-    return place_beams(raw, context.options, context.scratch)
+    source = raw.source
+    source.path, source.format, source.part = str(paths[0]), "carmen", window.part
+    source.duplicates = duplicates
+    source.details["gzip"] = is_gzip(paths[0])
+    return raw
 
 
 def _no_scan_error(path: Path, log: CarmenLog) -> InputError:
@@ -187,7 +177,7 @@ def _describe_lasers(lines: list[LaserLines], log: CarmenLog, options: ReadOptio
     lasers, poses, sensors = [], [], []
     for number, own in enumerate(lines):
         given, kind = options.laser(number), own.log.kind
-        pose = find_pose(own, log.params, warnings).override(given)
+        pose = find_pose(own, log.params, warnings).override(given.pose)
         upside_down, upside_down_how = _find_upside_down(kind, log.params, given)
         angles = _find_angles(own, log.params, given, warnings)
         angles = -angles if upside_down else angles
@@ -198,31 +188,31 @@ def _describe_lasers(lines: list[LaserLines], log: CarmenLog, options: ReadOptio
         lasers.append(laser)
         poses.append(pose.matrix()[None])
         sensors.append(
-            {
-                "name": kind,
-                "scans": len(own.stamp_ns),
-                "beams_per_scan": own.n_readings,
-                "start_angle": first,
-                "angle_step": step,
-                "upside_down": upside_down,
-                "upside_down_how": upside_down_how,
-                "extrinsics": pose._asdict(),
-            }
+            SensorNotes(
+                kind,
+                scans=len(own.stamp_ns),
+                beams_per_scan=own.n_readings,
+                start_angle=first,
+                angle_step=step,
+                upside_down=upside_down,
+                upside_down_how=upside_down_how,
+                extrinsics=pose,
+            )
         )
     odometry, odometry_notes = _find_odometry(lines, log, warnings)
     T_odom_base = None if odometry is None else se2.matrix(*odometry[scan_order(lasers)].T)
     params = {k: v for k, v in log.params.items() if k.startswith("robot_") and "laser" in k}
-    source = {
-        "lines": log.n_lines,
-        "records": dict(log.records),
-        "ignored": dict(log.ignored),
-        "sensors": sensors,
-        "odometry": odometry_notes,
-        "params": params,
-        "skipped_odometry": log.skipped_odometry.to_dict(),
-        "skipped": skipped.to_dict(),
-        "warnings": warnings,
-    }
+    source = Source(
+        details={"lines": log.n_lines},
+        records=dict(log.records),
+        ignored=dict(log.ignored),
+        sensors=sensors,
+        odometry=odometry_notes,
+        params=params,
+        skipped_odometry=log.skipped_odometry.by_reason(),
+        skipped=skipped.by_reason(),
+        warnings=warnings,
+    )
     return RawLasers(lasers, poses, T_odom_base, source)
 
 

@@ -5,7 +5,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.source import RangeRule
 from stillmap.core.timestamps import format_seconds
 from stillmap.io import laser_scan
 from stillmap.io.carmen.log import (
@@ -245,9 +245,9 @@ def write_filtered(job: FilterJob) -> Omissions:
     codes = [
         find_no_return_code(
             own.raw_laser([np.empty((own.n_readings, 2))] * len(own.log.configs)).sample_readings(),
-            notes["ranges"],
+            notes.ranges,
         )
-        for own, notes in zip(lasers, recording.source["sensors"], strict=True)
+        for own, notes in zip(lasers, recording.source.sensors, strict=True)
     ]
     omitted = 0
     with write_atomically(job.output) as file:
@@ -264,12 +264,12 @@ def write_filtered(job: FilterJob) -> Omissions:
     return Omissions(omitted)
 
 
-def find_no_return_code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
+def find_no_return_code(readings: NDArray[np.float32], rule: RangeRule | None) -> bytes:
     """The reading that means "no return" for a laser.
 
     Args:
         readings: (T, n) metres.
-        rule: its RangeRule as a dict.
+        rule: of the laser.
     """
     if np.any(readings >= MAX_PLAUSIBLE_RANGE):
         return b"inf"
@@ -279,9 +279,9 @@ def find_no_return_code(readings: NDArray[np.float32], rule: dict[str, Any]) -> 
         values, count = np.unique(codes, return_counts=True)
         # the most frequent one: a further code would hide from readers that it is one
         return str(values[count.argmax()]).encode("ascii")
-    if rule["zero_means"] == "max-range":
+    if rule is not None and rule.zero_means == "max-range":
         return b"0.00"
-    longest = max(float(rule["threshold"] or 0.0), float(readings.max(initial=0.0)))
+    longest = max(float((rule and rule.threshold) or 0.0), float(readings.max(initial=0.0)))
     return f"{_OVERFLOW if longest < _OVERFLOW else 10.0 * longest:.2f}".encode("ascii")
 
 

@@ -9,13 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.origin import Origin
 from stillmap.io.scan_files import list_files, stamps_from_names, strip_extension
-from stillmap.prepare.options import MAX_POINT_DISTANCE, ReadOptions
+from stillmap.prepare.options import MAX_POINT_DISTANCE
 from stillmap.prepare.time_window import TimeWindow
 
 _MAX_NAMES = 5  # of skipped files in a warning
@@ -53,22 +55,6 @@ class CloudSource(NamedTuple):
     stamp_ns: int | None = None
 
 
-class DatasetInfo(NamedTuple):
-    """Description of the file or folder being read.
-
-    Attributes:
-        path: of the file or folder.
-        format: name of the format.
-        warnings: on the input; more are added.
-        single: whether it is one file: damage is an error, nothing is skipped.
-    """
-
-    path: Path
-    format: str
-    warnings: list[str]
-    single: bool = False
-
-
 def read_clouds(
     path: Path,
     format: str,
@@ -91,7 +77,8 @@ def read_clouds(
     origin = Origin()
     read_cloud = partial(read_cloud, origin=origin, scratch=context.scratch)
     sources = sources_of(files_of(path, extensions), extensions, read_cloud)
-    recording = build_recording(sources, DatasetInfo(path, format, [], path.is_file()), context)
+    notes = Source(str(path), format=format)
+    recording = build_recording(sources, notes, context, single=path.is_file())
     origin.add_notes(recording)
     return recording
 
@@ -114,58 +101,53 @@ def sources_of(
 
 
 def build_recording(
-    sources: Sequence[CloudSource], info: DatasetInfo, context: ReadContext, **more: Any
+    sources: Sequence[CloudSource],
+    notes: Source,
+    context: ReadContext,
+    *,
+    single: bool = False,
+    images: Images | None = None,
 ) -> Recording:
-    """Build a recording from clouds; unreadable ones are skipped and counted in `source`.
+    """Build a recording from clouds; unreadable ones are skipped and counted.
 
     Args:
         sources: in order; scans without stamps are taken one second apart.
-        info: see DatasetInfo.
+        notes: on the file or folder; more are added.
         context: see ReadContext; the one sensor is the base of the robot.
-        more: other fields of the Recording.
+        single: whether it is one file: damage is an error, nothing is skipped.
+        images: of the recording; None: there are none.
 
     Raises:
         InputError: no cloud can be read, or a library is missing.
     """
-    _reject_laser_poses(context.options)
-    window, skipped = TimeWindow(context.options), SkippedRecords()
-    scans, lost = _ScanBuilder(sources, info, context, window), list[str]()
+    window, skipped, lost = TimeWindow(context.options), SkippedRecords(), list[str]()
+    scans = _ScanBuilder(sources, notes.warnings, context, window)
     known = [source.stamp_ns for source in sources if source.stamp_ns is not None]
     wanted = dict(zip(known, window.select_all(np.array(known, np.int64)).tolist(), strict=True))
     for number, source in enumerate(sources):
         if source.stamp_ns is not None and not wanted[source.stamp_ns]:
             continue
         try:
-            scans.add(number, source.stamp_ns, _read_source(source, info))
+            cloud = _read_source(source)
+            if single and not len(cloud.points):
+                raise InputError("holds no points", where=str(notes.path))
+            scans.add(number, source.stamp_ns, cloud)
         except InputError as error:
-            if info.single or isinstance(error, MissingExtra):
+            if single or isinstance(error, MissingExtra):
                 raise
             skipped.add(error.what.partition(":")[0], number + 1)
             lost.append(source.name)
         if context.progress is not None:
             context.progress((number + 1) / len(sources))
-    window.require_scans(str(info.path))
+    window.require_scans(str(notes.path))
     if not scans.numbers:
         reasons = f"usable scan: {skipped.summary('file')}" if skipped.total else "scan"
-        raise InputError(f"holds no {reasons}", where=str(info.path))
+        raise InputError(f"holds no {reasons}", where=str(notes.path))
     if lost:
         shown = ", ".join(lost[:_MAX_NAMES]) + (", ..." if len(lost) > _MAX_NAMES else "")
-        info.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
-    if "images" in more:
-        more["images"] = window.select_images(more["images"])
-    return scans.recording(skipped, **more)
-
-
-def _reject_laser_poses(options: ReadOptions) -> None:
-    """Refuse laser options, which are for 2D recordings.
-
-    Raises:
-        InputError: a pose, orientation or field of view is given.
-    """
-    options.check_laser_count(1)
-    laser = options.laser(0)
-    if laser.pose != (None, None, None) or laser.upside_down or laser.fov is not None:
-        raise InputError("the laser's place on the robot can be given for 2D recordings only")
+        notes.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
+    notes.skipped, notes.skipped_unit, notes.part = skipped.by_reason(), "file", window.part
+    return scans.build(notes, window.select_images(images))
 
 
 def reject(file: Path, what: str) -> Cloud:
@@ -173,16 +155,13 @@ def reject(file: Path, what: str) -> Cloud:
     raise InputError(what, where=str(file))
 
 
-def _read_source(source: CloudSource, info: DatasetInfo) -> Cloud:
+def _read_source(source: CloudSource) -> Cloud:
     try:
-        cloud = source.read()
+        return source.read()
     except MemoryError:
         raise InputError("does not fit into memory", where=source.name) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=source.name) from error
-    if info.single and not len(cloud.points):
-        raise InputError("holds no points", where=str(info.path))
-    return cloud
 
 
 class _ScanBuilder:
@@ -191,11 +170,11 @@ class _ScanBuilder:
     def __init__(
         self,
         sources: Sequence[CloudSource],
-        info: DatasetInfo,
+        warnings: list[str],
         context: ReadContext,
         window: TimeWindow,
     ) -> None:
-        self._info, self._context, self._window = info, context, window
+        self._warnings, self._scratch, self._window = warnings, context.scratch, window
         self._period = _median_period(sources)
         self._builder: RecordingBuilder | None = None
         self._clock: Clock | None = None
@@ -211,9 +190,9 @@ class _ScanBuilder:
                 self._clock = detect_clock(cloud.times[_usable_mask(points)], self._period)
                 if self._clock is None:
                     text = "the time field is ignored: no unit gives a plausible duration of a scan"
-                    self._info.warnings.append(text)
+                    self._warnings.append(text)
             timed = self._clock is not None
-            self._builder = RecordingBuilder(3, self._context, beam_times=timed)
+            self._builder = RecordingBuilder(3, self._scratch, beam_times=timed)
         stamp_ns, beam_time = cloud.stamp_ns if stamp_ns is None else stamp_ns, None
         if self._clock is not None and cloud.times is not None:
             usable = _usable_mask(points)
@@ -227,30 +206,17 @@ class _ScanBuilder:
         self._poses.append(cloud.T)
         self.numbers.append(number)
 
-    def recording(self, skipped: SkippedRecords, **more: Any) -> Recording:
+    def build(self, notes: Source, images: Images | None) -> Recording:
         assert self._builder is not None
-        info, warnings, options = self._info, self._info.warnings, self._context.options
         if self._without_stamp and len(self.numbers) > 1:
             text = f"{self._without_stamp} scans without a stamp are taken one second apart"
-            warnings.append(text)
-        T = self._stack_poses()
-        limits = ("min_range", "max_range", "free_range")
-        given = {name: getattr(options, name) for name in limits}
-        given = {name: v for name, v in given.items() if v != getattr(ReadOptions(), name)}
-        source = {
-            "path": str(info.path),
-            "format": info.format,
-            "skipped": skipped.to_dict(),
-            "skipped_unit": "file",
-            "warnings": warnings,
-            **({"read_options": given} if given else {}),
-            **self._window.notes(),
-        }
+            self._warnings.append(text)
         return self._builder.build(
             np.eye(4)[None],
-            source=source,
+            source=notes,
+            T_recorded_base=self._stack_poses(),
             record=np.array(self.numbers, np.int64),
-            **{"T_recorded_base": T, **more},
+            images=images,
         )
 
     def _stack_poses(self) -> NDArray[np.float64] | None:
@@ -259,7 +225,7 @@ class _ScanBuilder:
             return None
         if len(poses) < len(self._poses):
             missing = len(self._poses) - len(poses)
-            self._info.warnings.append(f"{missing} scans have no pose: poses are ignored")
+            self._warnings.append(f"{missing} scans have no pose: poses are ignored")
             return None
         return np.stack(poses)
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import (
     Cloud,
     CloudSource,
-    DatasetInfo,
     build_recording,
     files_of,
     library_errors,
@@ -69,8 +69,9 @@ def read(path: Path, context: ReadContext) -> Recording:
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
             read_cloud = partial(_read_cloud, file, scan, origin, context.scratch, damaged)
             sources.append(CloudSource(name, read_cloud))
-    info = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
-    recording = build_recording(sources, info, context)
+    single = path.is_file() and len(sources) == 1
+    notes = Source(str(path), format="E57")
+    recording = build_recording(sources, notes, context, single=single)
     origin.place(recording)
     if recording.T_recorded_base is None:
         origin.add_notes(recording)

@@ -16,16 +16,16 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.core.timestamps import format_seconds
 from stillmap.io import cameras, images
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
-from stillmap.io.point_cloud.clouds import Cloud, CloudSource, DatasetInfo
+from stillmap.io.point_cloud.clouds import Cloud, CloudSource
 from stillmap.io.point_cloud.origin import require_single_sensor, scan_hits, sensor_poses
 from stillmap.io.point_cloud.table import Field, TableLayout, parse_numbers
 from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
 from stillmap.io.scan_files import assign_rows, list_files, read_times
-from stillmap.prepare.beam_times import DIRECTION_KEY, STAMP_AZIMUTH_KEY
 
 Float = NDArray[np.float64]
 
@@ -109,12 +109,10 @@ def read(path: Path, context: ReadContext) -> Recording:
         if stamp_ns is None:
             read_cloud = partial(clouds.reject, file, "has no stamp")
         sources.append(CloudSource(file.name, read_cloud, stamp_ns))
-    info = DatasetInfo(path, "KITTI", warnings)
-    recording = clouds.build_recording(sources, info, context, images=pictures)
-    recording.source[STAMP_AZIMUTH_KEY] = _STAMP_AZIMUTH
+    notes = Source(str(path), format="KITTI", warnings=warnings, stamp_azimuth=_STAMP_AZIMUTH)
     if scans == _RAW:
-        recording.source[DIRECTION_KEY] = "clockwise"
-    return recording
+        notes.spin_direction = "clockwise"
+    return clouds.build_recording(sources, notes, context, images=pictures)
 
 
 def scan_layout(path: Path) -> TableLayout:

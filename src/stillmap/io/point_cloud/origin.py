@@ -11,7 +11,6 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.rigid_transforms import MAX_TRANSLATION, embed_in_3d
 
-_KEY = "origin"  # in the source of a recording
 _BLOCK = 1 << 20  # beams transformed at once
 _MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
 
@@ -46,22 +45,21 @@ class Origin:
         """Note the origin in the source of a recording, and warn that the sensor is assumed there;
         neither where points are `in_sensor_frame` and near its origin."""
         if self.position is not None and np.any(self.position != 0.0):
-            recording.source[_KEY] = self.position.tolist()
+            recording.source.origin = tuple(self.position.tolist())
             at = " ".join(f"{value:.0f}" for value in self.position)
             at = f"{at}, the new origin"
         elif in_sensor_frame:
             return
         else:
             at = "the origin"
-        recording.source["warnings"].append(f"no sensor pose is recorded: beams start at {at}")
+        recording.source.warnings.append(f"no sensor pose is recorded: beams start at {at}")
 
 
 def cloud_origin(recording: Recording) -> NDArray[np.float64]:
     """(3,) metres by which the coordinates of a recording's clouds were shifted in reading."""
-    noted = recording.source.get(_KEY) if recording.dimension == 3 else None
-    origin = np.array([] if noted is None else noted, np.float64)
-    usable = origin.shape == (3,) and (np.abs(origin) < MAX_TRANSLATION).all()
-    return origin if usable else np.zeros(3)
+    noted = recording.source.origin if recording.dimension == 3 else None
+    origin = np.array(noted or (0.0, 0.0, 0.0))
+    return origin if (np.abs(origin) < MAX_TRANSLATION).all() else np.zeros(3)
 
 
 def place_clouds(

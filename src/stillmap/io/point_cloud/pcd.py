@@ -19,9 +19,10 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
-from stillmap.io.point_cloud.clouds import Cloud, DatasetInfo
+from stillmap.io.point_cloud.clouds import Cloud
 from stillmap.io.point_cloud.origin import Origin, require_single_sensor, scan_hits, sensor_poses
 from stillmap.io.point_cloud.table import Columns, Field, TableLayout
 from stillmap.io.rigid_transforms import pose_from_quaternion, quaternion_from_pose
@@ -157,15 +158,14 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no scan can be read.
     """
     files, origin = clouds.files_of(path, EXTENSIONS), Origin()
-    info = DatasetInfo(path, "PCD", [], single=path.is_file())
+    notes = Source(str(path), format="PCD")
     in_map_frame = _detect_map_frame(files)
     if in_map_frame:
         text = "points are in the map frame: transformed to the sensor frame by VIEWPOINT"
-        info.warnings.append(text)
+        notes.warnings.append(text)
     read_cloud = partial(_read_cloud, in_map_frame=in_map_frame, origin=origin)
-    recording = clouds.build_recording(
-        clouds.sources_of(files, EXTENSIONS, read_cloud), info, context
-    )
+    sources = clouds.sources_of(files, EXTENSIONS, read_cloud)
+    recording = clouds.build_recording(sources, notes, context, single=path.is_file())
     origin.place(recording)
     if recording.T_recorded_base is None:
         origin.add_notes(recording, in_sensor_frame=True)

@@ -4,7 +4,6 @@ Centimetres, x right, y up, z ahead, left-handed; stillmap has metres, x ahead, 
 is a position and intrinsic x-y-z Euler angles in degrees.
 """
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,11 +13,11 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import (
     Cloud,
     CloudSource,
-    DatasetInfo,
     build_recording,
     files_of,
 )
@@ -44,14 +43,13 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no scan can be read.
     """
-    files, options = files_of(path, EXTENSIONS), context.options
-    info = DatasetInfo(path, "3DTK", [], single=path.is_file())
-    code = _find_max_range_code(files) if options.max_range is None else None
+    files = files_of(path, EXTENSIONS)
+    code = _find_max_range_code(files) if context.options.max_range is None else None
+    notes = Source(str(path), format="3DTK", max_range=code)
     if code is not None:
-        info.warnings.append(f"ranges from {code:.2f} m on are a maximum-range code of the laser")
-        context = context._replace(options=replace(options, max_range=code))
+        notes.warnings.append(f"ranges from {code:.2f} m on are a maximum-range code of the laser")
     sources = [CloudSource(file.name, partial(_read_cloud, file)) for file in files]
-    return build_recording(sources, info, context)
+    return build_recording(sources, notes, context, single=path.is_file())
 
 
 def _find_max_range_code(files: list[Path]) -> float | None:

@@ -1,9 +1,9 @@
 """PointCloud2 messages: collected by topic and frame, as a 3D recording."""
 
 from array import array
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.source import SensorNotes, Source
 from stillmap.core.timestamps import longest_non_decreasing
-from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
+from stillmap.io.builder import RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.clouds import (
     Cloud,
     convert_times,
@@ -24,8 +25,8 @@ from stillmap.io.point_cloud.table import record_dtype
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
     TIME_BACKWARDS,
-    UNREADABLE,
     Message,
+    SkippedByTopic,
     decode,
     frame_name,
     stamp_ns,
@@ -118,40 +119,29 @@ class CloudCollector:
         timed: sensors with beam times.
         number: (T,) number of the message of each scan on its topic, from 1.
         scans: stamps, sensors and points.
-        skipped: messages that were skipped, by topic.
     """
 
-    def __init__(self, context: ReadContext) -> None:
-        self._count: Counter[str] = Counter()  # messages by topic
-        self.skipped: dict[str, SkippedRecords] = {}
+    def __init__(self, scratch: Path | None, skipped: SkippedByTopic) -> None:
+        self.skipped = skipped
         self.sensors: dict[tuple[str, str], int] = {}
         self.timed: set[int] = set()
         self.number = array("q")
-        self.scans = RecordingBuilder(3, context, beam_times=True)
+        self.scans = RecordingBuilder(3, scratch, beam_times=True)
 
-    def add_message(self, message: Message, *, skip: bool = False) -> None:
-        """Add a message, or `skip` it undecoded; one that cannot be used is counted."""
-        topic = message.channel.topic
-        self._count[topic] += 1
-        if skip:
-            return
-        frame, stamp = "", 0
-        cloud: Cloud | str
-        try:
-            raw = decode(message)
-            frame, stamp = frame_name(raw.header.frame_id), stamp_ns(raw.header)
-            cloud = parse_cloud(raw)
-        except Exception:  # any error of rosbags about damaged bytes
-            cloud = UNREADABLE
+    def add(self, message: Message, number: int) -> str | None:
+        """Add a message, by its number on the topic; returns the reason if it cannot be used."""
+        raw = decode(message)
+        cloud = parse_cloud(raw)
         if isinstance(cloud, str):
-            self.skipped.setdefault(topic, SkippedRecords()).add(cloud, self._count[topic])
-            return
-        stamp = stamp or message.log_ns  # some drivers leave it unset
-        sensor = self.sensors.setdefault((topic, frame), len(self.sensors))
+            return cloud
+        stamp = stamp_ns(raw.header) or message.log_ns  # some drivers leave it unset
+        name = message.channel.topic, frame_name(raw.header.frame_id)
+        sensor = self.sensors.setdefault(name, len(self.sensors))
         if cloud.times is not None:
             self.timed.add(sensor)
         self.scans.add_scan(stamp, cloud.points, sensor=sensor, beam_time=cloud.times)
-        self.number.append(self._count[topic])
+        self.number.append(number)
+        return None
 
     def by_points(self) -> list[int]:
         """The sensors, most points first: other clouds are derived from these."""
@@ -164,8 +154,7 @@ class CloudCollector:
         rows = np.flatnonzero(np.asarray(self.scans.sensor) == sensor)
         keep = longest_non_decreasing(np.asarray(self.scans.stamp_ns)[rows].tolist())
         topic, _ = list(self.sensors)[sensor]
-        skipped = self.skipped.setdefault(topic, SkippedRecords())
-        skipped.add_all(TIME_BACKWARDS, np.delete(np.asarray(self.number)[rows], keep))
+        self.skipped[topic].add_all(TIME_BACKWARDS, np.delete(np.asarray(self.number)[rows], keep))
         return rows[keep]
 
 
@@ -207,17 +196,15 @@ def read_clouds(
         T_odom_base=odom,
         images=find_images(poses.base),
         record=np.asarray(clouds.number, np.int64),
-        source={
-            "sensors": [
-                {"name": name, "frame": frame, "scans": n} for (name, frame), n in described
-            ],
-            "base_frame": poses.base,
-            "base_frame_how": poses.how,
-            "odometry": origin,
-            "skipped": SkippedRecords().merge(*clouds.skipped.values()).to_dict(),
-            "duplicates": omitted,
-            "warnings": warnings,
-        },
+        source=Source(
+            sensors=[SensorNotes(name, frame, n) for (name, frame), n in described],
+            base_frame=poses.base,
+            base_frame_how=poses.how,
+            odometry=origin,
+            skipped=SkippedRecords().merge(*clouds.skipped.values()).by_reason(),
+            duplicates=omitted,
+            warnings=warnings,
+        ),
     )
     timed = clouds.timed.intersection(chosen)
     return recording if timed else replace(recording, beam_time=None)

@@ -86,10 +86,10 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
 
 def _number_scans(job: FilterJob) -> tuple[set[str], dict[tuple[str, int], int]]:
     """The topics that were read, and the scan of each message on them, by topic and number."""
-    recording, sensors = job.recording, job.recording.source["sensors"]
+    recording, sensors = job.recording, job.recording.source.sensors
     if recording.record is None:
         raise other_recording_error(job.source)
-    names = np.repeat([s["name"] for s in sensors], [s.get("places", 1) for s in sensors])
+    names = np.repeat([s.name for s in sensors], [s.places for s in sensors])
     topic = names[recording.sensor].tolist()
     keys = zip(topic, recording.record.tolist(), strict=True)
     return set(topic), {key: scan for scan, key in enumerate(keys)}
@@ -102,8 +102,8 @@ def _blank(message: Message, mask: Mask, job: FilterJob) -> Any:
         _blank_points(content, mask, topic)
         return content
     key = topic, frame_name(content.header.frame_id)
-    sensors = {(s["name"], s["frame"]): s["ranges"] for s in job.recording.source["sensors"]}
-    code = np.float32(0.0 if sensors[key]["zero_means"] == "max-range" else math.inf)
+    rule = next(s.ranges for s in job.recording.source.sensors if (s.name, s.frame) == key)
+    code = np.float32(0.0 if rule and rule.zero_means == "max-range" else math.inf)
     if message.channel.type == MULTI_ECHO:
         for k in np.flatnonzero(mask):
             content.ranges[k].echoes = np.array([code])

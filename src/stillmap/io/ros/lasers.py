@@ -5,7 +5,8 @@ The scans of a laser that tilts become a 3D recording, by the transforms at the 
 
 import math
 from array import array
-from collections import Counter
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,21 +16,20 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, advise
-from stillmap.core.recording import Recording
+from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
     MULTI_ECHO,
     TIME_BACKWARDS,
-    UNREADABLE,
     Message,
+    SkippedByTopic,
     decode,
     frame_name,
     stamp_ns,
 )
-from stillmap.prepare import lasers
-from stillmap.prepare.lasers import Beams, LaserPose, RawLaser, RawLasers
+from stillmap.prepare.lasers import Beams, RawLaser, RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 Float = NDArray[np.float64]
@@ -71,12 +71,11 @@ class ScanShape(NamedTuple):
         return self.angle_min + self.angle_increment * np.arange(self.n, dtype=np.float64)
 
 
-class LaserScans(NamedTuple):
-    """T usable scans of one laser, ordered by their stamps.
+class LaserScans:
+    """The scans of one laser, by topic and frame.
 
-    Attributes:
-        topic, frame: of the messages.
-        stamp_ns: (T,) int64.
+    Attributes, once it is finished:
+        stamp_ns: (T,) int64, not decreasing.
         number: (T,) int64 number of the message on its topic, from 1.
         start: (T,) int64 index of the first reading of each in `ranges`.
         shape: (T,) int32 index into `shapes`.
@@ -85,15 +84,58 @@ class LaserScans(NamedTuple):
         warnings: sentences.
     """
 
-    topic: str
-    frame: str
     stamp_ns: NDArray[np.int64]
     number: NDArray[np.int64]
     start: NDArray[np.int64]
     shape: NDArray[np.int32]
-    shapes: list[ScanShape]
     ranges: NDArray[np.float32]
-    warnings: list[str]
+
+    def __init__(self, topic: str, frame: str, scratch: Path | None) -> None:
+        self.topic, self.frame = topic, frame
+        self.warnings: list[str] = []
+        self._rows = array("q")  # stamp, log time, number and shape of each scan
+        self._shapes: dict[ScanShape, int] = {}
+        self._ranges = ArrayBuilder(np.float32, (), scratch)
+
+    def add(
+        self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
+    ) -> str | None:
+        """Add a scan; returns the reason if it cannot be used."""
+        names = ("range_min", "range_max", "time_increment")
+        more = (getattr(message, name) for name in names)
+        shape = ScanShape(message.angle_min, message.angle_increment, len(ranges), *more)
+        if shape not in self._shapes and (fault := shape.find_fault()) is not None:
+            return fault
+        known = self._shapes.setdefault(shape, len(self._shapes))
+        self._rows.extend((stamp_ns(message.header), log_ns, number, known))
+        self._ranges.append(ranges)
+        return None
+
+    def finish(self, skipped: SkippedRecords) -> None:
+        """Keep the scans with non-decreasing stamps, without repeated ones; others are counted."""
+        ranges = self.ranges = self._ranges.finish()
+        stamps, log_ns, number, shape = np.asarray(self._rows, np.int64).reshape(-1, 4).T.copy()
+        n = np.array([s.n for s in self.shapes], np.int64)[shape]
+        start = np.cumsum(n) - n
+        if np.mean(stamps == 0) > 0.5:
+            stamps = log_ns
+            what = f"{self.topic}: headers have no stamps: log times are used"
+            todo = "let the driver stamp its scans: log times come later and jitter"
+            self.warnings.append(advise(what, todo))
+        keep = longest_non_decreasing(stamps.tolist())
+        skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
+        repeated = np.zeros(len(keep), np.bool_)
+        for k in np.flatnonzero(np.diff(stamps[keep]) == 0) + 1:
+            a, b = (ranges[start[t] : start[t] + n[t]] for t in keep[[k - 1, k]])
+            repeated[k] = np.array_equal(a, b, equal_nan=True)
+        skipped.add_all(REPEATED, number[keep[repeated]])
+        keep = keep[~repeated]
+        self.stamp_ns, self.number, self.start = stamps[keep], number[keep], start[keep]
+        self.shape = shape[keep].astype(np.int32)
+
+    @property
+    def shapes(self) -> list[ScanShape]:
+        return list(self._shapes)
 
     @property
     def n_scans(self) -> int:
@@ -114,7 +156,7 @@ class LaserScans(NamedTuple):
             self.ranges,
             self.start,
             self.shape,
-            [lasers.unit_vectors(sign * s.angles()).astype(np.float32) for s in self.shapes],
+            [unit_vectors(sign * s.angles()).astype(np.float32) for s in self.shapes],
             self._beam_steps(),
             usual.range_min,
             usual.range_max if 0.0 < usual.range_max < MAX_PLAUSIBLE_RANGE else None,
@@ -132,95 +174,23 @@ class LaserScans(NamedTuple):
         return tuple(np.where(plausible, steps, 0.0).tolist())
 
 
-class _ScanBuffer:
-    """The scans of one laser on one topic, in recorded order."""
-
-    def __init__(self, topic: str, frame: str, scratch: Path | None) -> None:
-        self.topic, self.frame = topic, frame
-        self.stamp_ns, self.log_ns, self.number = array("q"), array("q"), array("q")
-        self.shape = array("i")  # index into shapes
-        self.shapes: dict[ScanShape, int] = {}
-        self.ranges = ArrayBuilder(np.float32, (), scratch)
-
-    def add(
-        self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
-    ) -> str | None:
-        """Add a scan; returns the reason if it cannot be used."""
-        names = ("range_min", "range_max", "time_increment")
-        more = (getattr(message, name) for name in names)
-        shape = ScanShape(message.angle_min, message.angle_increment, len(ranges), *more)
-        if shape not in self.shapes and (fault := shape.find_fault()) is not None:
-            return fault
-        self.shape.append(self.shapes.setdefault(shape, len(self.shapes)))
-        self.stamp_ns.append(stamp_ns(message.header))
-        self.log_ns.append(log_ns)
-        self.number.append(number)
-        self.ranges.append(ranges)
-        return None
-
-    def finish(self, skipped: SkippedRecords) -> LaserScans:
-        """The scans with non-decreasing stamps, without repeated ones; others are counted."""
-        ranges, shapes = self.ranges.finish(), list(self.shapes)
-        shape = np.asarray(self.shape, np.int32)
-        n = np.array([s.n for s in shapes], np.int64)[shape]
-        start = np.cumsum(n) - n
-        stamps, warnings = np.asarray(self.stamp_ns, np.int64), []
-        if np.mean(stamps == 0) > 0.5:
-            stamps = np.asarray(self.log_ns, np.int64)
-            what = f"{self.topic}: headers have no stamps: log times are used"
-            todo = "let the driver stamp its scans: log times come later and jitter"
-            warnings.append(advise(what, todo))
-        keep = longest_non_decreasing(stamps.tolist())
-        number = np.asarray(self.number)
-        skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
-        repeated = np.zeros(len(keep), np.bool_)
-        for k in np.flatnonzero(np.diff(stamps[keep]) == 0) + 1:
-            a, b = (ranges[start[t] : start[t] + n[t]] for t in keep[[k - 1, k]])
-            repeated[k] = np.array_equal(a, b, equal_nan=True)
-        skipped.add_all(REPEATED, number[keep[repeated]])
-        keep = keep[~repeated]
-        return LaserScans(
-            self.topic,
-            self.frame,
-            stamps[keep],
-            number[keep],
-            start[keep],
-            shape[keep],
-            shapes,
-            ranges,
-            warnings,
-        )
-
-
 class LaserCollector:
     """Collects the scans of all lasers: one topic may carry several, by frame."""
 
-    def __init__(self, context: ReadContext) -> None:
-        self._scratch = context.scratch
-        self._lasers: dict[tuple[str, str], _ScanBuffer] = {}
-        self.skipped: dict[str, SkippedRecords] = {}
-        self._count: Counter[str] = Counter()  # messages by topic
+    def __init__(self, scratch: Path | None, skipped: SkippedByTopic) -> None:
+        self._scratch, self.skipped = scratch, skipped
+        self._lasers: dict[tuple[str, str], LaserScans] = {}
 
-    def add_message(self, message: Message, *, skip: bool = False) -> None:
-        """Add a message, or `skip` it undecoded; one that cannot be used is counted."""
-        topic = message.channel.topic
-        self._count[topic] += 1
-        if skip:
-            return
-        try:
-            scan = decode(message)
-            frame = frame_name(scan.header.frame_id)
-            ranges = _first_echoes(scan) if message.channel.type == MULTI_ECHO else scan.ranges
-        except Exception:  # any error of rosbags about damaged bytes
-            fault: str | None = UNREADABLE
-        else:
-            known = self._lasers.get((topic, frame))
-            laser = known or _ScanBuffer(topic, frame, self._scratch)
-            fault = laser.add(scan, ranges, message.log_ns, self._count[topic])
-            if fault is None:
-                self._lasers[topic, frame] = laser
-        if fault is not None:
-            self.skipped.setdefault(topic, SkippedRecords()).add(fault, self._count[topic])
+    def add(self, message: Message, number: int) -> str | None:
+        """Add a message, by its number on the topic; returns the reason if it cannot be used."""
+        topic, scan = message.channel.topic, decode(message)
+        frame = frame_name(scan.header.frame_id)
+        ranges = _first_echoes(scan) if message.channel.type == MULTI_ECHO else scan.ranges
+        laser = self._lasers.get((topic, frame)) or LaserScans(topic, frame, self._scratch)
+        fault = laser.add(scan, ranges, message.log_ns, number)
+        if fault is None:
+            self._lasers[topic, frame] = laser
+        return fault
 
     def finish(self) -> list[LaserScans]:
         """The lasers with at least one usable scan: most scans first, then most beams.
@@ -228,11 +198,9 @@ class LaserCollector:
         Raises:
             InputError: there is none.
         """
-        of_all = [
-            laser.finish(self.skipped.setdefault(laser.topic, SkippedRecords()))
-            for laser in self._lasers.values()
-        ]
-        usable = [scans for scans in of_all if scans.n_scans]
+        for laser in self._lasers.values():
+            laser.finish(self.skipped[laser.topic])
+        usable = [laser for laser in self._lasers.values() if laser.n_scans]
         if not usable:
             total = SkippedRecords().merge(*self.skipped.values())
             raise InputError(f"holds no usable laser scan: {total.summary('message')}")
@@ -256,8 +224,8 @@ def _select_lasers(
     return [scans[order[k]] for k in poses.used], poses, omitted
 
 
-def read_lasers(collector: LaserCollector, frames: tf.Frames, context: ReadContext) -> Recording:
-    """The 2D recording of all lasers.
+def read_lasers(collector: LaserCollector, frames: tf.Frames, context: ReadContext) -> RawLasers:
+    """The 2D scans of all lasers.
 
     Raises:
         InputError: no scan can be used, or options do not fit the lasers.
@@ -269,32 +237,31 @@ def read_lasers(collector: LaserCollector, frames: tf.Frames, context: ReadConte
     raw, mounts, sensors = [], [], []
     for number, scans in enumerate(used):
         mount, notes = _find_mount(scans, poses, number, options, warnings)
-        raw.append(scans.to_raw(notes["upside_down"]))
+        raw.append(scans.to_raw(bool(notes.upside_down)))
         mounts.append(mount)
         sensors.append(notes)
-    order = lasers.scan_order(raw)
+    order = scan_order(raw)
     stamps = np.concatenate([s.stamp_ns for s in used])[order]
     odom, origin = tf.find_odometry(frames, poses.base, stamps, options, warnings)
     skipped = SkippedRecords().merge(*(collector.skipped[t] for t in {s.topic for s in used}))
     warnings += skipped.loss_warnings(sum(s.n_scans for s in used), "message")
-    source = {
-        "sensors": sensors,
-        "base_frame": poses.base,
-        "base_frame_how": poses.how,
-        "odometry": origin,
-        "skipped": skipped.to_dict(),
-        "duplicates": omitted,
-        "warnings": warnings,
-    }
+    source = Source(
+        sensors=sensors,
+        base_frame=poses.base,
+        base_frame_how=poses.how,
+        odometry=origin,
+        skipped=skipped.by_reason(),
+        duplicates=omitted,
+        warnings=warnings,
+    )
     T_odom_base = None if odom is None else tf.project_to_plane(odom)[0]
     record = np.concatenate([s.number for s in used])[order]
-    whole = RawLasers(raw, mounts, T_odom_base, source, record)
-    return lasers.place_beams(whole, options, context.scratch)
+    return RawLasers(raw, mounts, T_odom_base, source, record)
 
 
 def _find_mount(
     scans: LaserScans, poses: tf.SensorPoses, number: int, options: ReadOptions, warnings: list[str]
-) -> tuple[Float, dict[str, Any]]:
+) -> tuple[Float, SensorNotes]:
     """T_base_sensor (1, 3, 3) of a laser, or (T, 3, 3) where it moves, and notes on it."""
     flat, upside_down, tilts = tf.project_to_plane(poses.T_base_sensor[number])
     given, upside_down_how = options.laser(number), "TF"
@@ -307,29 +274,29 @@ def _find_mount(
     if not moves or given.pose != (None, None, None):
         how = f"TF from {poses.base} to {scans.frame}"
         how = "the laser is the robot's frame" if scans.frame == poses.base else how
-        pose = pose._replace(how=how).override(given)
+        pose = replace(pose, how=how).override(given.pose)
         flat = pose.matrix()[None]
     if given.upside_down is not None:
         upside_down, upside_down_how = given.upside_down, "given"
     shape, sign = scans.typical_shape, -1.0 if upside_down else 1.0
-    return flat, {
-        "name": scans.topic,
-        "frame": scans.frame,
-        "scans": scans.n_scans,
-        "beams_per_scan": shape.n,
-        "start_angle": sign * shape.angle_min,
-        "angle_step": sign * shape.angle_increment,
-        "upside_down": upside_down,
-        "upside_down_how": upside_down_how,
-        "extrinsics": pose._asdict(),
-        "places": len(flat),
-    }
+    return flat, SensorNotes(
+        scans.topic,
+        scans.frame,
+        scans.n_scans,
+        len(flat),
+        shape.n,
+        sign * shape.angle_min,
+        sign * shape.angle_increment,
+        upside_down,
+        upside_down_how,
+        extrinsics=pose,
+    )
 
 
 def read_tilting_laser(
     collector: LaserCollector, frames: tf.Frames, context: ReadContext
-) -> Recording:
-    """The 3D recording of a laser that tilts or pans.
+) -> RawLasers:
+    """The scans of a laser that tilts or pans, to become a 3D recording.
 
     Every scan has a sensor of its own at the laser's pose at the scan's stamp; beams are placed by
     the laser's pose at their own times. Where transforms are missing, beams are unusable.
@@ -346,51 +313,29 @@ def read_tilting_laser(
         hint = "transforms must say how the joint moves, as robot_state_publisher does"
         what = f"{scans.topic}: {scans.frame!r} does not tilt in {poses.base!r}"
         raise InputError(what, hint=hint)
-    raw = scans.to_raw()
-    rule, more = lasers.find_range_rule(raw, context.options)
-    beams = lasers.convert_to_beams([raw], [rule], context.scratch)
-    tree, points = frames.tree, arrays.empty((len(beams.points), 3), np.float32, context.scratch)
-    n_lost = _convert_to_3d(tree, poses.base, scans, beams, T_base_sensor, points)
-    warnings = [*scans.warnings, *(f"{scans.topic}: {text}" for text in more)]
-    if n_lost:
-        warnings.append(f"{n_lost} beams where transforms do not say how the laser is tilted")
     skipped = collector.skipped[scans.topic]
-    notes = {
-        "name": scans.topic,
-        "frame": scans.frame,
-        "scans": scans.n_scans,
-        "places": scans.n_scans,
-        "ranges": rule.to_dict(),
-    }
-    source = {
-        "sensors": [notes],
-        "base_frame": poses.base,
-        "base_frame_how": poses.how,
-        "skipped": skipped.to_dict(),
-        "warnings": warnings + skipped.loss_warnings(scans.n_scans, "message"),
-    }
-    return Recording(
-        stamp_ns=scans.stamp_ns,
-        offset=beams.offset,
-        points=points,
-        hit=beams.hit & ~np.isnan(points[:, 0]),
-        T_base_sensor=T_base_sensor,
-        sensor=np.arange(scans.n_scans, dtype=np.int32),
-        T_odom_base=None,
-        beam_time=beams.beam_time,
-        source=source,
+    notes = SensorNotes(scans.topic, scans.frame, scans.n_scans, places=scans.n_scans)
+    source = Source(
+        sensors=[notes],
+        base_frame=poses.base,
+        base_frame_how=poses.how,
+        skipped=skipped.by_reason(),
+        warnings=scans.warnings + skipped.loss_warnings(scans.n_scans, "message"),
     )
+    to_3d = partial(_convert_to_3d, frames.tree, poses.base, scans, T_base_sensor, context.scratch)
+    return RawLasers([scans.to_raw()], [T_base_sensor], None, source, to_3d=to_3d)
 
 
 def _convert_to_3d(
     tree: tf.TransformTree,
     base: str,
     scans: LaserScans,
-    beams: Beams,
     T_base_sensor: Float,
-    points: NDArray[np.float32],
-) -> int:
-    """Set points (M, 3) in the laser's frame at its scan's stamp; the number of lost beams."""
+    scratch: Path | None,
+    beams: Beams,
+) -> tuple[NDArray[np.float32], list[str]]:
+    """Points (M, 3) in the laser's frame at its scan's stamp, and a warning about lost beams."""
+    points = arrays.empty((len(beams.points), 3), np.float32, scratch)
     stamps, M, n_lost = np.sort(tree.stamps_between(base, scans.frame)), len(points), 0
     for first in range(0, M, _BLOCK):
         block = slice(first, min(first + _BLOCK, M))
@@ -407,7 +352,8 @@ def _convert_to_3d(
         n_lost += int(np.count_nonzero(is_lost & np.isfinite(ends[:, 0])))
         points[block] = np.where(is_lost[:, None], np.nan, ends + T[:, :3, 3])
         arrays.release_pages(points)
-    return n_lost
+    text = f"{n_lost} beams where transforms do not say how the laser is tilted"
+    return points, [text] * (n_lost > 0)
 
 
 def _is_covered(stamps: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ bag by its first bytes loads none of the libraries.
 
 import re
 import struct
+from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -78,6 +79,9 @@ class Message(NamedTuple):
     channel: Channel
     log_ns: int
     raw: bytes
+
+
+SkippedByTopic = defaultdict[str, SkippedRecords]
 
 
 class Bag(Protocol):

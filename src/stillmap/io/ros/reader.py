@@ -1,5 +1,6 @@
 """Reads ROS bags as recordings, without ROS: selects topics, and collects their messages once."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -30,11 +31,13 @@ from stillmap.io.ros.messages import (
     Channel,
     DamagedBagError,
     Message,
+    SkippedByTopic,
     decode,
     find_fault,
     peek_stamp_ns,
 )
 from stillmap.io.ros.tf import Frames, Odometry, TransformTree
+from stillmap.prepare.lasers import RawLasers
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
@@ -42,7 +45,7 @@ _STATIC = "tf_static"
 _PROGRESS_INTERVAL = 2000  # messages
 
 
-def read(path: Path, context: ReadContext) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording | RawLasers:
     """Read a bag: ROS 1, or a file or folder of ROS 2; see `read_parts`."""
     return read_parts([path], context)
 
@@ -53,7 +56,7 @@ def read_parts(
     others: Sequence[Path] = (),
     *,
     tilting: bool = False,
-) -> Recording:
+) -> Recording | RawLasers:
     """Read bags that are parts of one run as one.
 
     Bad messages are skipped and counted. A bag that is cut, damaged or without an index is read
@@ -82,11 +85,12 @@ def read_parts(
             what = f"{error.what}; it is damaged: {damage}" if damage else error.what
             raise InputError(what, where=error.where or where, hint=error.hint) from error
         else:
-            recording.source.update(path=where, format=bag.kind)
+            source = recording.source
+            source.path, source.format = where, bag.kind
             if damage:
                 what = f"the bag is cut or damaged ({damage}): what could be read is used"
                 todo = "copy it again; if it was recorded so, the map ends where the bag does"
-                recording.source["warnings"].insert(0, advise(what, todo))
+                source.warnings.insert(0, advise(what, todo))
             return recording
     raise InputError(f"is damaged: {damage}", where=where)
 
@@ -97,7 +101,7 @@ def _read_bag(
     reopen: Callable[[], Bag],
     others: Sequence[Path],
     tilting: bool,
-) -> Recording:
+) -> Recording | RawLasers:
     topics = select_topics(bag, context.options)
     content = collect_messages(bag, topics, context)
     if others and not _static_topics(bag):
@@ -109,17 +113,17 @@ def _read_bag(
             images = content.images.build_images(content.transforms, base, reopen)
             return content.window.select_images(images)
 
-        recording = read_clouds(content.clouds, frames, context.options, find_images)
+        recording: Recording | RawLasers = read_clouds(
+            content.clouds, frames, context.options, find_images
+        )
     else:
         read_scans = read_tilting_laser if tilting else read_lasers
         recording = read_scans(content.lasers, frames, context)
-    recording.source.update(
-        topics=topics.notes,
-        skipped_unit="message",
-        damage=bag.damage.to_dict(),
-        skipped_odometry=content.skipped_odometry.to_dict(),
-        **content.window.notes(),
-    )
+    source = recording.source
+    source.topics, source.skipped_unit = topics.notes, "message"
+    source.damage = bag.damage.by_reason()
+    source.skipped_odometry = content.skipped_odometry.by_reason()
+    source.part = content.window.part
     return recording
 
 
@@ -233,6 +237,8 @@ class BagContent:
     lasers: LaserCollector
     clouds: CloudCollector
     window: TimeWindow
+    skipped: SkippedByTopic
+    count: Counter[str] = field(default_factory=Counter)  # scans by topic
     images: ImageCollector = field(default_factory=ImageCollector)
     transforms: TransformTree = field(default_factory=TransformTree)
     odometry_by_topic: dict[str, Odometry] = field(default_factory=dict)
@@ -253,10 +259,10 @@ class BagContent:
         """Add a message; scans and images outside the time window are not decoded."""
         topic = message.channel.topic
         if use == "scans":
+            self.count[topic] += 1
             stamp = peek_stamp_ns(message) if self.window else None
-            skip = stamp is not None and not self.window.select(stamp)
-            scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
-            scans.add_message(message, skip=skip)
+            if stamp is None or self.window.select(stamp):
+                self._add_scan(message)
         elif use == "images":
             # one CameraInfo holds for all images
             whole = not self.window or message.channel.type == CAMERA_INFO
@@ -268,6 +274,18 @@ class BagContent:
                 self._add_pose(message, use)
             except Exception:  # any error of rosbags about damaged bytes
                 self.unreadable.add(f"{UNREADABLE} ({topic})", number)
+
+    def _add_scan(self, message: Message) -> None:
+        topic = message.channel.topic
+        scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
+        try:
+            fault = scans.add(message, self.count[topic])
+        except OSError:  # the disk is full
+            raise
+        except Exception:  # any error of rosbags about damaged bytes
+            fault = UNREADABLE
+        if fault is not None:
+            self.skipped[topic].add(fault, self.count[topic])
 
     def _add_pose(self, message: Message, use: str | None) -> None:
         topic = message.channel.topic
@@ -288,8 +306,12 @@ def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) 
         DamagedBagError: an indexed bag is damaged.
         InputError: no scan lies in the window.
     """
-    window = TimeWindow(context.options)
-    content = BagContent(LaserCollector(context), CloudCollector(context), window)
+    window, skipped = TimeWindow(context.options), SkippedByTopic(SkippedRecords)
+    collectors = (
+        LaserCollector(context.scratch, skipped),
+        CloudCollector(context.scratch, skipped),
+    )
+    content = BagContent(*collectors, window, skipped)
     total = sum(c.n_messages for c in bag.channels if c.topic in selection.uses)
     for number, message in enumerate(bag.messages(set(selection.uses)), start=1):
         count_output(len(message.raw))

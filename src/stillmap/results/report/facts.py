@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from stillmap.core.errors import split_advice
-from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.core.json import to_jsonable
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
@@ -51,14 +51,14 @@ _STAGES = {
 def run_data(result: MappingResult) -> dict[str, Any]:
     """Title, headline figures and warnings."""
     source, stamps, stages = result.recording.source, result.recording.stamp_ns, result.stages
-    path = str(source.get("path", ""))
+    path = source.path or ""
     findings = [split_advice(text) for text in result.warnings]
     return {
         "name": Path(path).name or "recording",
         "path": path,
-        "format": str(source.get("format", "")),
+        "format": source.format or "",
         "scans": result.recording.n_scans,
-        "skipped": count_skipped(source),
+        "skipped": source.n_skipped,
         "beams": count_beams(result.recording, result.p_static),
         "duration": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
         "seconds": sum(float(stage.get("seconds") or 0) for stage in stages.values()),
@@ -118,7 +118,7 @@ def stages_data(result: MappingResult) -> list[tuple[str, float, int]]:
 
 def source_data(result: MappingResult) -> dict[str, Any]:
     """The reader's notes on the recording, without empty entries."""
-    source = to_jsonable(result.recording.source)
+    source = to_jsonable(result.recording.source.to_dict())
     skipped = {name: source.pop(name, None) or {} for name in ("skipped", "skipped_odometry")}
     source.pop("warnings", None)  # shown at the top
     return {

@@ -1,6 +1,6 @@
 """The beams of a result's recording in the map frame."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +55,7 @@ class Beams:
         D, T = self.recording.dimension, self.recording.n_scans
         first, end = max(scan - _NEIGHBORS[D], 0), min(scan + _NEIGHBORS[D] + 1, T)
         near = deskew_recording(
-            slice_scans(self.recording, first, end), self.poses[first:end], self.slam
+            self.recording.slice_scans(first, end), self.poses[first:end], self.slam
         )
         beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
         use = np.flatnonzero(near.hit[at])
@@ -85,27 +85,8 @@ class Beams:
         """Dynamic end points (n, D) of scans first:end."""
         beams = slice(*self.recording.offset[[first, end]].tolist())
         poses = self.poses[first:end]
-        block = deskew_recording(slice_scans(self.recording, first, end), poses, self.slam)
+        block = deskew_recording(self.recording.slice_scans(first, end), poses, self.slam)
         use = np.flatnonzero(block.hit & (self.p_static[beams] < 0.5))
         ends = block.end_points(use, poses)
         self.recording.release_pages(self.p_static)
         return ends
-
-
-def slice_scans(recording: Recording, first: int, end: int) -> Recording:
-    """Scans first:end without odometry, as views of the arrays."""
-    beams = slice(int(recording.offset[first]), int(recording.offset[end]))
-    times = recording.beam_time
-    return replace(
-        recording,
-        stamp_ns=recording.stamp_ns[first:end],
-        offset=recording.offset[first : end + 1] - recording.offset[first],
-        points=recording.points[beams],
-        hit=recording.hit[beams],
-        sensor=recording.sensor[first:end],
-        T_odom_base=None,
-        T_recorded_base=None,
-        beam_time=None if times is None else times[beams],
-        images=None,
-        record=None,
-    )
