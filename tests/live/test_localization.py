@@ -18,7 +18,8 @@ class Place:
     """A map of a world without people, and runs through it."""
 
     def __init__(self, world, seed, folder):
-        simulation = simulate(scene_by_name(world, {"crowd": {"people": 0}}), seed)
+        changes = {"crowd": {"people": 0}, "robot": {"scan_rate": 2.5}}
+        simulation = simulate(scene_by_name(world, changes), seed)
         self.folder, self._world = folder, world
         self._T_map_world = se2.inverse(simulation.truth.T_world_base[0])
         poses = self._T_map_world @ simulation.truth.T_world_base
