@@ -48,8 +48,9 @@ class FilterTarget(NamedTuple):
     @property
     def takes_poses(self) -> bool:
         """True of formats of points at poses: those of the map, where none are recorded."""
-        is_other = self.writer is not None and self.writer.name != "stillmap"
-        return is_other and "T_recorded_base" in self.writer.fields  # type: ignore[union-attr]
+        if self.writer is None or self.writer.name == "stillmap":
+            return False
+        return "T_recorded_base" in self.writer.fields
 
 
 def _write_stillmap(job: FilterJob) -> Omissions:
