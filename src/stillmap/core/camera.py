@@ -197,44 +197,44 @@ def _distort(lens: Lens, x: Float) -> Float:
     return out
 
 
-def _undistort(lens: Lens, wanted: Float) -> Float:
+def _undistort(lens: Lens, target: Float) -> Float:
     """(n, 2) undistorted from distorted normalized coordinates (n, 2); NaN: no solution.
 
     Newton's method with step halving while the error grows or the step leaves the injective disc.
     """
     if lens[0] == "":
-        return wanted.copy()
+        return target.copy()
     radius = np.tan(_limit(lens))
-    r = np.sqrt(_square(wanted))
-    x: Float = wanted * np.minimum(1.0, 0.5 * radius / np.maximum(r, 1e-300))[:, None]
-    open_ = np.flatnonzero(np.isfinite(wanted).all(axis=1))
-    error = np.full(len(wanted), np.inf)
-    error[open_] = _norm(_distort(lens, x[open_]) - wanted[open_])
+    r = np.sqrt(_square(target))
+    x: Float = target * np.minimum(1.0, 0.5 * radius / np.maximum(r, 1e-300))[:, None]
+    open_ = np.flatnonzero(np.isfinite(target).all(axis=1))
+    error = np.full(len(target), np.inf)
+    error[open_] = _norm(_distort(lens, x[open_]) - target[open_])
     for _ in range(_MAX_ITERATIONS):
         open_ = open_[error[open_] > _TOLERANCE]
         if not len(open_):
             break
-        step = _newton_step(lens, x[open_], wanted[open_])
+        step = _newton_step(lens, x[open_], target[open_])
         improved = np.zeros(len(open_), np.bool_)
         for half in range(6):
-            tried = x[open_] - 0.5**half * np.where(improved[:, None], 0.0, step)
-            found = _norm(_distort(lens, tried) - wanted[open_])
-            taken = ~improved & (found < error[open_]) & (_square(tried) < radius**2)
-            x[open_[taken]], error[open_[taken]] = tried[taken], found[taken]
+            trial = x[open_] - 0.5**half * np.where(improved[:, None], 0.0, step)
+            trial_error = _norm(_distort(lens, trial) - target[open_])
+            taken = ~improved & (trial_error < error[open_]) & (_square(trial) < radius**2)
+            x[open_[taken]], error[open_[taken]] = trial[taken], trial_error[taken]
             improved |= taken
         open_ = open_[improved]
     x[~(error < _MAX_ERROR)] = np.nan
     return x
 
 
-def _newton_step(lens: Lens, x: Float, wanted: Float) -> Float:
+def _newton_step(lens: Lens, x: Float, target: Float) -> Float:
     """(n, 2) Newton steps, with the Jacobian in radial and tangential coordinates."""
     r = np.sqrt(_square(x))
     u = np.divide(x, r[:, None], out=np.zeros_like(x), where=r[:, None] > 0.0)
     u[r == 0.0] = (1.0, 0.0)
     v = _rotate_90_degrees(u)
     along, across, mixed = _jacobian(lens, r, u)
-    residual = _distort(lens, x) - wanted
+    residual = _distort(lens, x) - target
     a, b = np.sum(residual * u, axis=1), np.sum(residual * v, axis=1)
     det = along * across - mixed * mixed
     radial, tangential = (across * a - mixed * b) / det, (along * b - mixed * a) / det

@@ -33,8 +33,8 @@ def printable(text: str) -> str:
     return _CONTROL.sub(_escape, text)
 
 
-def _escape(found: re.Match[str]) -> str:
-    number = ord(found[0])
+def _escape(match: re.Match[str]) -> str:
+    number = ord(match[0])
     return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}"
 
 
@@ -86,9 +86,9 @@ def closest_match(word: str, known: Iterable[str], min_similarity: float = 0.6) 
     """
     from difflib import get_close_matches  # only for messages
 
-    originals = {one.lower(): one for one in known}
-    found = get_close_matches(word.lower(), originals, n=1, cutoff=min_similarity)
-    return originals[found[0]] if found else None
+    originals = {name.lower(): name for name in known}
+    matches = get_close_matches(word.lower(), originals, n=1, cutoff=min_similarity)
+    return originals[matches[0]] if matches else None
 
 
 class MissingExtra(InputError):

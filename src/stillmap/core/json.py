@@ -35,12 +35,12 @@ def _reject_nul(content: Any) -> None:
     """Refuse texts with NUL, which no path, topic or name can hold."""
     rest = [content]
     while rest:
-        one = rest.pop()
-        if isinstance(one, dict):
-            rest += [*one, *one.values()]
-        elif isinstance(one, list):
-            rest += one
-        elif isinstance(one, str) and "\0" in one:
+        item = rest.pop()
+        if isinstance(item, dict):
+            rest += [*item, *item.values()]
+        elif isinstance(item, list):
+            rest += item
+        elif isinstance(item, str) and "\0" in item:
             raise ValueError("a text holds NUL")
 
 

@@ -66,12 +66,12 @@ def component_labels(pairs: Index, n: int) -> Index:
 def _label_few(pairs: Index, n: int) -> Index:
     """Components numbered by their first nodes: each node takes the lowest of its neighbours."""
     first = np.arange(n)
-    one, other = np.ascontiguousarray(pairs.T)
+    node, neighbor = np.ascontiguousarray(pairs.T)
     while True:
-        lowest = np.minimum(first[one], first[other])
+        lowest = np.minimum(first[node], first[neighbor])
         before = first.copy()
-        np.minimum.at(first, one, lowest)
-        np.minimum.at(first, other, lowest)
+        np.minimum.at(first, node, lowest)
+        np.minimum.at(first, neighbor, lowest)
         first = first[first]
         if np.array_equal(first, before):
             return np.asarray(np.unique(first, return_inverse=True)[1], np.intp)

@@ -58,7 +58,7 @@ class TiledArray(NDArrayOperatorsMixin):
         return whole if dtype is None else whole.astype(dtype, copy=bool(copy))
 
     def __array_ufunc__(self, function: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        made = (np.asarray(one) if isinstance(one, TiledArray) else one for one in inputs)
+        made = (np.asarray(item) if isinstance(item, TiledArray) else item for item in inputs)
         return getattr(function, method)(*made, **options)
 
     def __getitem__(self, key: Any) -> Any:
@@ -264,11 +264,11 @@ def tiles_around(
     first, last = np.maximum(lowest, 0), np.minimum(lowest + edge - 1, last_cell)
     overlap = (first <= last).all(axis=1)
     first, last = first[overlap] // TILE, last[overlap] // TILE
-    found: set[tuple[int, int]] = set()
+    tiles: set[tuple[int, int]] = set()
     for offset in itertools.product(range(-(-edge // TILE) + 1), repeat=2):
         tile = np.unique(np.minimum(first + np.array(offset), last)[:, ::-1], axis=0)
-        found.update((int(i), int(j)) for i, j in tile)
-    return sorted(found)
+        tiles.update((int(i), int(j)) for i, j in tile)
+    return sorted(tiles)
 
 
 def _by_tile(row: Index, column: Index) -> Iterator[tuple[tuple[int, int], Index]]:

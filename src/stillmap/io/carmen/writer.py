@@ -174,10 +174,10 @@ def _choose_format(recording: Recording) -> LogFormat:
 
 
 def _require_one_count(counts: NDArray[np.int64]) -> None:
-    found = np.unique(counts)
-    if len(found) > 1 or np.any(found == 0):
+    sizes = np.unique(counts)
+    if len(sizes) > 1 or np.any(sizes == 0):
         what = "in a CARMEN log all scans of a laser have the same number"
-        text = f"scans of {found.min()} to {found.max()} beams: {what}"
+        text = f"scans of {sizes.min()} to {sizes.max()} beams: {what}"
         raise InputError(text, hint=_ALTERNATIVE)
 
 
