@@ -102,7 +102,7 @@ def reconstruct_object(
         if rigid and not returns.inputs.is_planar and len(mesh.vertices) >= _MIN_VERTICES:
             shape = _merge_partial_scans(one, own, now, fast, returns)
         shape = shape or ObjectShape(one.object.id, mesh, frame, False, now, scan.span)
-        p_dynamic = mean_p_dynamic(shape.mesh, shape.frame, shape.span, returns.inputs)
+        p_dynamic = _mean_p_dynamic(shape.mesh, shape.frame, shape.span, returns.inputs)
         return shape if p_dynamic >= _MIN_P_DYNAMIC else None
     return None
 
@@ -128,12 +128,8 @@ def _is_large_enough(mesh: Mesh, area: float) -> bool:
     return bool(np.ptp(mesh.vertices[:, 2]) >= _MIN_HEIGHT)
 
 
-def mean_p_dynamic(
-    mesh: Mesh,
-    frame: ObjectFrame,
-    span: tuple[float, float],
-    inputs: MeshInputs,
-    max_distance: float = _POINT_DISTANCE,
+def _mean_p_dynamic(
+    mesh: Mesh, frame: ObjectFrame, span: tuple[float, float], inputs: MeshInputs
 ) -> float:
     """Mean P(c = 0) of the returns around an object, but for those on the ground.
 
@@ -142,15 +138,15 @@ def mean_p_dynamic(
         frame: pose of that frame.
         span: s, start and end.
         inputs: the beams.
-        max_distance: metres from the surface.
 
     Returns:
         NaN where there are no such returns.
     """
     deskewed = inputs.deskewed
-    fine, _ = subdivide(mesh, _SAMPLE_SHARE * max_distance)
+    fine, _ = subdivide(mesh, _SAMPLE_SHARE * _POINT_DISTANCE)
     tree = cKDTree(fine.vertices)
-    low, high = fine.vertices.min(axis=0) - max_distance, fine.vertices.max(axis=0) + max_distance
+    low = fine.vertices.min(axis=0) - _POINT_DISTANCE
+    high = fine.vertices.max(axis=0) + _POINT_DISTANCE
     low[2] = max(low[2], _MIN_RETURN_HEIGHT)
     scans, offset = inputs.scans_within(*span), deskewed.offset
     beams = np.arange(offset[scans.start], offset[scans.stop])
@@ -158,7 +154,7 @@ def mean_p_dynamic(
     then = (seconds >= span[0]) & (seconds <= span[1]) & deskewed.hit[beams]
     at = frame.to_object(seconds[then], deskewed.end_points(beams[then], inputs.poses))
     some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
-    distance = tree.query(at[some], distance_upper_bound=max_distance)[0]
+    distance = tree.query(at[some], distance_upper_bound=_POINT_DISTANCE)[0]
     near = inputs.p_static[beams[then][some[np.isfinite(distance)]]]
     return 1.0 - float(near.mean(dtype=np.float64)) if len(near) else float("nan")
 

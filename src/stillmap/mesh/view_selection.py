@@ -34,7 +34,7 @@ _MAX_LOG_GAIN = np.log(2.0)
 
 
 class Candidates(NamedTuple):
-    """The K best images of F faces, best first.
+    """The K best images of F faces, best first until some are dropped.
 
     Attributes:
         view: (F, K) number of the view; -1: none.
@@ -174,12 +174,10 @@ def reject_inconsistent_views(
     off[tested] = np.linalg.norm(colors[tested] - median, axis=2)
     majority = 2 * (off < 0.5 * max_difference).sum(axis=1) > known
     out = majority[:, None] & (off > max_difference)
-    utility = np.where(out, np.float32(-np.inf), candidates.utility)
-    order, row = np.argsort(-utility, axis=1, kind="stable"), np.arange(len(utility))[:, None]
     return Candidates(
-        np.where(out, np.int32(NONE), candidates.view)[row, order],
-        utility[row, order],
-        np.where(out, np.float32(0.0), candidates.p_static)[row, order],
+        np.where(out, np.int32(NONE), candidates.view),
+        np.where(out, np.float32(-np.inf), candidates.utility),
+        np.where(out, np.float32(0.0), candidates.p_static),
     )
 
 

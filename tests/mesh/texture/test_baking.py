@@ -11,7 +11,6 @@ from stillmap.mesh import texture
 from stillmap.mesh.texture import (
     bake_texture,
     fill_gutters,
-    sample_bilinear,
 )
 
 pytest.importorskip("xatlas")
@@ -68,13 +67,3 @@ def test_gutters_have_the_colours_beside_them():
     assert (page[2:12, 1:12] == (200, 10, 30)).all()
     assert (page[9:18, 17:30] == (20, 240, 90)).all()
     assert painted.sum() == 10 * 11 + 9 * 13
-
-
-def test_between_pixels():
-    picture = np.zeros((2, 3, 3), np.uint8)
-    picture[0, 1], picture[1, 2] = 100, 200
-    at = np.array([[1.0, 0.0], [1.5, 0.0], [1.5, 0.5], [9.0, 9.0], [-3.0, 0.2]])
-    found = sample_bilinear(picture, at)
-    np.testing.assert_allclose(found, np.array([100, 50, 75, 200, 0])[:, None].repeat(3, axis=1))
-    single = np.full((1, 1, 3), 9, np.uint8)
-    assert (sample_bilinear(single, at) == 9).all()
