@@ -230,6 +230,7 @@ def integrate_patches(
     for done, tile in enumerate(tiles, start=1):
         parts.append(simplify(extract_tile(volume, tile, min_weight), error))
         tell(done, len(tiles))
+    del volume  # frees the voxels before the mesh grows
     mesh = remove_small_components(weld(concatenate_meshes(parts)), min_area)
     return simplify_to_budget(simplify(mesh, error), error, max_faces)
 
