@@ -110,15 +110,15 @@ def _person(spot: SurfacePoints) -> Float:
         colour = np.where(face[:, None], _SKIN, _HAIR)
         eyes = face & (np.abs(up - 0.55) < 0.07) & (np.abs(np.abs(around) - 0.45) < 0.16)
         return np.where(eyes[:, None], (20.0, 20.0, 30.0), colour)
-    one, other = _pick_colors(_CLOTHES, mover, seed)
+    shirt, trousers = _pick_colors(_CLOTHES, mover, seed)
     if z[0] <= 0.0:
-        trousers = 0.55 * other * (1.0 + 0.25 * np.sin(8 * around))[:, None]
-        return np.where((w < 0.09)[:, None], _SHOE, trousers)
+        folds = (1.0 + 0.25 * np.sin(8 * around))[:, None]
+        return np.where((w < 0.09)[:, None], _SHOE, 0.55 * trousers * folds)
     pattern = _hash_number(mover, seed + 7) % 3
     bands, spokes = np.floor(w / 0.07), np.floor(around / (np.pi / 5))
     checked = (bands, spokes, bands + spokes)[pattern].astype(np.int64) % 2 == 0
     belt = (w < z[0] + 0.05)[:, None]
-    return np.where(belt, _SHOE, np.where(checked[:, None], one, other))
+    return np.where(belt, _SHOE, np.where(checked[:, None], shirt, trousers))
 
 
 def _vehicle(spot: SurfacePoints) -> Float:
@@ -150,9 +150,9 @@ def _door(spot: SurfacePoints) -> Float:
 
 
 def _thing(spot: SurfacePoints) -> Float:
-    one, other = _pick_colors(_CLOTHES, spot.mover, spot.seed)
+    light, dark = _pick_colors(_CLOTHES, spot.mover, spot.seed)
     squares = np.floor(spot.local / 0.15 + 0.01).astype(np.int64).sum(axis=1)
-    return np.where((squares % 2 == 0)[:, None], one, 0.7 * one + 0.3 * other)
+    return np.where((squares % 2 == 0)[:, None], light, 0.7 * light + 0.3 * dark)
 
 
 def _pick_colors(palette: Float, mover: int, seed: int) -> tuple[Float, Float]:

@@ -286,7 +286,7 @@ class _World:
         if len(self.doors.share):
             standing = np.concatenate([crowd.xy, robot.pose[None, :2]])
             way = robot.route_ahead(DOOR_RANGE)[None]
-            ways = [split_into_segments(one) for one in (crowd.next_corners(DOOR_RANGE), way)]
+            ways = [split_into_segments(path) for path in (crowd.next_corners(DOOR_RANGE), way)]
             self.doors.step(dt, standing, np.concatenate(ways))
         if self.traffic.kinds:
             self.traffic.step(dt, robot.pose[:2], self._radius)

@@ -151,9 +151,9 @@ def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
     """Lower flat ranges to a face (4,), or (4, T) if it moves; returns the beams that changed."""
     x0, y0, x1, y1 = face
     bearing = np.arctan2(y0 - scans.y, x0 - scans.x)
-    other = np.arctan2(y1 - scans.y, x1 - scans.x)
-    turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
-    scan, beam = scans.covered(np.where(turn >= 0, bearing, other), np.abs(turn))
+    end = np.arctan2(y1 - scans.y, x1 - scans.x)
+    turn = (end - bearing + np.pi) % (2 * np.pi) - np.pi
+    scan, beam = scans.covered(np.where(turn >= 0, bearing, end), np.abs(turn))
     nx, ny = np.broadcast_to(y0 - y1, turn.shape), np.broadcast_to(x1 - x0, turn.shape)
     height = nx * (x0 - scans.x) + ny * (y0 - scans.y)
     with np.errstate(divide="ignore", invalid="ignore"):

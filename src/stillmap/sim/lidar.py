@@ -1,7 +1,7 @@
 """3D sensors: beam patterns, poses and measurements."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,11 +9,8 @@ from stillmap.core import se2
 from stillmap.sim import laser, ray_casting
 from stillmap.sim.geometry import (
     BOX,
-    Faces,
     Float,
-    Ground,
     Part,
-    StaticSurfaces,
     assemble,
     make_pose,
 )
@@ -75,7 +72,7 @@ class Sensor(NamedTuple):
         pattern: the beams of each scan.
         takes_time: whether the beams of a scan have different times.
         leaves_out: whether beams without return are left out.
-        own: returns from the robot itself.
+        own: (n, C) metres to the robot itself; inf: it is not met.
     """
 
     name: str
@@ -85,7 +82,7 @@ class Sensor(NamedTuple):
     pattern: Callable[[int], Pattern]
     takes_time: bool
     leaves_out: bool = False
-    own: RayReturns | None = None
+    own: Float | None = None
 
     def cast_rays(self, world: World, pattern: Pattern, scan: int) -> RayReturns:
         """Exact returns of the beams of one scan."""
@@ -94,9 +91,12 @@ class Sensor(NamedTuple):
         exact = ray_casting.cast_rays(rays, world.static, world.movers.at(moment, scan))
         if self.own is None:
             return exact
-        nearer = self.own.range < exact.range
-        both: Any = zip(self.own, exact, strict=True)
-        return RayReturns._make(np.where(nearer, *pair) for pair in both)
+        nearer = self.own < exact.range
+        return exact._replace(
+            range=np.minimum(self.own, exact.range),
+            mover=np.where(nearer, np.int32(ROBOT), exact.mover),
+            on_glass=exact.on_glass & ~nearer,
+        )
 
 
 def make_spinning_lidar(scene: Scene) -> Sensor:
@@ -155,20 +155,16 @@ def transform_rays(pattern: Pattern, T_world_sensor: Float) -> Rays:
     return Rays(origin, turned, azimuth, float(off), pattern.elevation, tilt)
 
 
-def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> RayReturns:
-    """Returns from the robot itself: a box as large as its footprint, or as given."""
+def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Float:
+    """(n, C) metres to the robot itself: a box as large as its footprint, or as given."""
     o, radius = scene.lidar, scene.robot.radius
     top = max(o.z - o.roof_below, 0.1)
     ahead = radius if o.roof_length is None else 0.5 * o.roof_length
     aside = 0.8 * radius if o.roof_width is None else 0.5 * o.roof_width
     box = assemble([(0, ROBOT, Part(BOX, 0.0, 0.0, (ahead, aside), (0.0, top)))])
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
-    nothing = assemble([]).at(np.empty((1, 0, 3)), np.empty((1, 0)))
-    faces = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
-    level = Ground(np.zeros(2), np.empty((0, 4)), 0.0)
-    static = StaticSurfaces(faces, nothing, level, None)
-    seen = ray_casting.cast_rays(transform_rays(pattern, T_base_sensor[None]), static, body)
-    return seen._replace(range=np.where(seen.mover == ROBOT, seen.range, np.inf))
+    rays = transform_rays(pattern, T_base_sensor[None])
+    return ray_casting.intersect_solid(rays.origin, rays.direction, body, 0, body.pose[:, 0])
 
 
 def lift_poses(poses: Float) -> Float:

@@ -1,7 +1,7 @@
 """Parameters of a scene: sensors, robot, odometry, people, doors, vehicles, ground and heights."""
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
@@ -28,26 +28,31 @@ def require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
+def ascending(*pairs: tuple[str, str]) -> Any:
+    """A validator of options of which the first of each pair must not exceed the second."""
+
+    def check(options: Any) -> Any:
+        for low, high in pairs:
+            is_ordered = getattr(options, low) <= getattr(options, high)
+            require(is_ordered, f"{low} must not exceed {high}")
+        return options
+
+    return model_validator(mode="after")(check)
+
+
 @dataclass(frozen=True, config=STRICT)
 class CrowdOptions:
     """The people."""
 
     people: Count = option(15, "Number of people.", ge=0)
-    shape: Literal["legs", "bodies", "mixed"] = option(
-        "mixed", "Cross section at the laser: legs, bodies, or half each."
-    )
+    shape: Shape = option("mixed", "Cross section at the laser: legs, bodies, or half each.")
     min_speed: Positive = option(0.4, "Minimum walking speed, m/s.")
     max_speed: Positive = option(1.6, "Maximum walking speed, m/s.")
     stopping_share: Share = option(0.33, "Share of people who stop at times.")
     min_stop: NotNegative = option(2.0, "Minimum duration of a stop, s.")
     max_stop: NotNegative = option(20.0, "Maximum duration of a stop, s.")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        """Refuses empty ranges."""
-        require(self.min_speed <= self.max_speed, "speeds must satisfy min_speed <= max_speed")
-        require(self.min_stop <= self.max_stop, "stops must satisfy min_stop <= max_stop")
-        return self
+    _check = ascending(("min_speed", "max_speed"), ("min_stop", "max_stop"))
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -60,12 +65,7 @@ class DoorOptions:
     max_closed: Positive = option(120.0, "Maximum time a door stays closed, s.")
     swing: Positive = option(1.5, "Time from closed to open, s.")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        """Refuses empty ranges."""
-        for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
-            require(low <= high, "times of doors must satisfy min <= max")
-        return self
+    _check = ascending(("min_open", "max_open"), ("min_closed", "max_closed"))
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -78,11 +78,7 @@ class TrafficOptions:
     stopping_share: Share = option(0.2, "Share of vehicles that stop at times.")
     max_stop: float = option(12.0, "Maximum duration of a stop, s.", ge=3)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        """Refuses empty ranges."""
-        require(self.min_speed <= self.max_speed, "speeds must satisfy min_speed <= max_speed")
-        return self
+    _check = ascending(("min_speed", "max_speed"))
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -117,12 +113,12 @@ class LaserOptions:
     @property
     def recorded_mount(self) -> tuple[float, float, float]:
         """x, y, yaw as the recorder has them."""
-        told = (self.recorded_x, self.recorded_y, self.recorded_yaw)
-        x, y, yaw = (
-            true if value is None else value
-            for value, true in zip(told, (self.x, self.y, self.yaw), strict=True)
+        x, y, yaw = self.recorded_x, self.recorded_y, self.recorded_yaw
+        return (
+            self.x if x is None else x,
+            self.y if y is None else y,
+            self.yaw if yaw is None else yaw,
         )
-        return x, y, yaw
 
     @property
     def count(self) -> int:

@@ -172,8 +172,8 @@ def _find_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Candidate]
         return
     ox, oy, oz, move = _middle(rays)
     x0, y0, x1, y1 = faces.ends.T
-    bearing, other = np.arctan2(y0 - oy, x0 - ox), np.arctan2(y1 - oy, x1 - ox)
-    turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
+    bearing, end = np.arctan2(y0 - oy, x0 - ox), np.arctan2(y1 - oy, x1 - ox)
+    turn = (end - bearing + np.pi) % (2 * np.pi) - np.pi
     far = np.maximum(np.hypot(x0 - ox, y0 - oy), np.hypot(x1 - ox, y1 - oy))
     levels = np.stack([ground.level(x0, y0), ground.level(x1, y1)])
     low = levels.min(axis=0) + faces.z[:, 0] - oz

@@ -122,8 +122,8 @@ class Thing:
 
     def __post_init__(self) -> None:
         require(len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays")
-        for one, other in itertools.pairwise(self.stays):
-            in_order = one.until is not None and one.until <= other.since
+        for stay, later in itertools.pairwise(self.stays):
+            in_order = stay.until is not None and stay.until <= later.since
             require(in_order, "stays of a thing must come one after the other")
 
 

@@ -55,8 +55,8 @@ def make_static_world(scene: Scene, ground: Ground) -> StaticSurfaces:
     is_glass = np.zeros(len(ends), bool)
     is_glass[len(lines) : len(lines) + len(scene.glass)] = True
     faces = Faces(np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass)
-    parts = [(k, -1, p) for k, one in enumerate(loops) for p in make_parts(one, scene.heights)]
-    poses = np.reshape([one[:3] for one in loops], (1, -1, 3)).astype(float)
+    parts = [(k, -1, p) for k, loop in enumerate(loops) for p in make_parts(loop, scene.heights)]
+    poses = np.reshape([loop[:3] for loop in loops], (1, -1, 3)).astype(float)
     solids = assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
     return StaticSurfaces(faces, solids, ground, scene.heights.ceiling)
 
