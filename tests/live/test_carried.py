@@ -18,7 +18,8 @@ BEFORE, AFTER = 300, 60
 def answers():
     """Updates, poses in hindsight and true poses: after 300 scans the robot is put back to where it
     was 200 scans before."""
-    simulation = simulate(scene_by_name("hall", {"crowd": {"people": 5}}), 1)
+    changes = {"crowd": {"people": 5}, "robot": {"scans": BEFORE}}
+    simulation = simulate(scene_by_name("hall", changes), 1)
     odometry, beams = simulation.recording.T_odom_base, list(iter_beams(simulation.recording))
     scans = np.append(np.arange(BEFORE), np.arange(100, 100 + AFTER))
     given, updates = odometry[0], []
