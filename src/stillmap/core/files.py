@@ -181,28 +181,6 @@ def temporary_folder(output: Path) -> Iterator[Path]:
 
 @contextmanager
 @defer_signals
-def new_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
-    """Context manager of a new folder, of which nothing is left if the block fails.
-
-    Args:
-        prefix: start of its name.
-        parent: where it lies; None: among temporary files.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    parent = Path(tempfile.gettempdir()) if parent is None else parent
-    folder = parent / f"{prefix}{secrets.token_hex(8)}"
-    try:
-        folder.mkdir(mode=0o700)
-        yield folder
-    except BaseException:
-        remove(folder)
-        raise
-
-
-@contextmanager
-@defer_signals
 def atomic_file(path: Path) -> Iterator[Path]:
     """Context manager of an empty temporary file that takes the place of `path` on success.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, TypeAlias
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder, new_folder
+from stillmap.core.files import atomic_folder, remove
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
@@ -297,8 +298,12 @@ def _require_apart(output: Path, job: MergeJob) -> None:
 
 
 def _merge_temporarily(job: MergeJob, report: Progress) -> Result:
-    with new_folder("stillmap-place-") as home:
+    home = Path(tempfile.mkdtemp(prefix="stillmap-place-"))
+    try:
         merge_sessions(job, home / "place", progress=report)
         place = load(home / "place")
-        remove_with(place, home)
+    except BaseException:
+        remove(home)
+        raise
+    remove_with(place, home)
     return place
