@@ -53,7 +53,7 @@ def run(place, simulation, scans, **settings):
     "first", [900, *(pytest.param(k, marks=pytest.mark.slow) for k in (100, 1700))]
 )
 def test_the_robot_is_found_anywhere(hall, first):
-    simulation = hall.simulate(201, crowd={"people": 10})
+    simulation = hall.simulate(201, crowd={"people": 10}, robot={"scans": first + 40})
     answers = run(hall, simulation, range(first, first + 40))
     k, update, _ = next(answers)
     while "lost" in update.doubts:
