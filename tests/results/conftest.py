@@ -189,7 +189,7 @@ SOURCE = {
             "ranges": asdict(
                 RangeRule(12.0, "12 m repeats (919 x)", "unusable", "", 12.0, "", 0.0)
             ),
-            "bearings": [-1.5708, 1.5708],
+            "start_angle": -1.5708,
         }
     ],
     "ignored": {},

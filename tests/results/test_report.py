@@ -385,6 +385,6 @@ def test_calibration(result):
 def test_details_of_the_recording(page):
     text = "".join(page.text)
     assert "threshold how: 12 m repeats (919 x)" in text
-    assert "bearings: -90°, 90°" in text
+    assert "start angle: -90°" in text
     assert "stamp goes back, 2 times: lines 88, 91" in text
     assert "ignored" not in text

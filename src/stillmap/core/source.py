@@ -159,6 +159,10 @@ class Source:
     origin: tuple[float, float, float] | None = None
     details: dict[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.sensors)} sensors, {len(self.warnings)} warnings"
+        return f"<Source: {self.format or 'unknown format'}, {self.path}, {counts}>"
+
     @property
     def has_depth_camera(self) -> bool:
         """True if scans of a sensor are the grids of depth images."""

@@ -26,8 +26,6 @@ from stillmap.prepare.time_window import TimeWindow, select_time
 RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated robot
 
 _HEAD = 1 << 16  # bytes from which a format is detected
-_MAX_ENTRIES = 1000  # of a folder, searched for recordings
-_MAX_LISTED = 3  # recordings in a message
 _FORMATS_HINT = "`stillmap info -h` lists the formats"
 
 Reader = Callable[[Path, ReadContext], Recording | RawLasers]
@@ -164,7 +162,7 @@ def _no_recording_error(path: Path) -> InputError:
     inside = _find_recordings(path)
     if not inside:
         return InputError("is a folder without a recording", where=str(path), hint=_FORMATS_HINT)
-    shown = ", ".join(map(str, inside[:_MAX_LISTED])) + ", ..." * (len(inside) > _MAX_LISTED)
+    shown = ", ".join(map(str, inside[:3])) + ", ..." * (len(inside) > 3)
     if tuple(entry.name for entry in inside) == RIG_FOLDERS:
         hint = f"both: {inside[0]} with tilting={inside[1]}"
     else:
@@ -176,7 +174,7 @@ def _no_recording_error(path: Path) -> InputError:
 def _find_recordings(path: Path) -> list[Path]:
     """The entries of a folder that are recordings, by name."""
     try:
-        entries = sorted(islice(path.iterdir(), _MAX_ENTRIES))
+        entries = sorted(islice(path.iterdir(), 1000))
     except OSError:
         return []
     return [entry for entry in entries if is_recording(entry)]

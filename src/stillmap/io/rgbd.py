@@ -44,7 +44,6 @@ SCENES, TUM = "7-Scenes", "TUM RGB-D"
 _FRAME = re.compile(r"frame-([0-9]{1,9})\.(depth|color)\.(png|jpg|jpeg)")
 _INTRINSICS = ("camera-intrinsics.txt", "camera.txt")
 _RATE = 30  # images per second where no file holds stamps
-_MAX_MATRIX_BYTES = 1 << 12  # of a matrix in text
 _MAX_POSE_GAP_NS = 100_000_000  # between an image and the poses around it
 
 
@@ -150,7 +149,7 @@ def _read_matrix(path: Path, count: int) -> Float | None:
         if not path.is_file():
             return None
         with InputFile(path) as file:
-            words = file.read(_MAX_MATRIX_BYTES).split()
+            words = file.read(1 << 12).split()
         n = round(count**0.5)
         return np.array([float(word) for word in words]).reshape(n, n)
     except (InputError, OSError, ValueError):
@@ -226,7 +225,6 @@ T_BASE_CAMERA = np.array(
 COLOR, DEPTH = "color", "depth"  # names of the cameras
 
 _MAX_DEPTH = 5.0  # m: structured light gives no reliable depth beyond
-_RAYS_AT_ONCE = 1 << 20  # of a depth camera, which are computed with three times the memory
 _MAX_UNITS = 65535  # of 16 bits: 7-Scenes has it where depth is unknown
 
 
@@ -332,7 +330,8 @@ def _make_grid(camera: Camera, options: ReadOptions, scale: float) -> _Grid:
     step = options.depth_step
     columns, rows = (np.arange(0, size, step) for size in (camera.width, camera.height))
     rays = np.empty((len(rows), len(columns), 3), np.float32)
-    some = max(_RAYS_AT_ONCE // max(len(columns), 1), 1)
+    # some at once: they are computed with three times the memory
+    some = max((1 << 20) // max(len(columns), 1), 1)
     for first in range(0, len(rows), some):
         part = np.meshgrid(columns, rows[first : first + some])
         pixels = np.stack(part, axis=-1).reshape(-1, 2).astype(np.float64)

@@ -32,9 +32,6 @@ Float = NDArray[np.float64]
 MARKER = "times.txt"  # only folders with this file are overwritten
 
 _EARTH = 6378137.0  # m
-_STAMP_AZIMUTH = 0.0  # rad: the laser faces ahead at the stamp
-_MAX_POSES = 10_000_000  # of a file
-_MAX_CALIBRATION = 1 << 20  # bytes of a file
 _FIELDS = tuple(Field(name, np.dtype("<f4")) for name in ("x", "y", "z", "reflectance"))
 _RECORD = 16  # bytes of a point
 _CAMERA_FOLDER = re.compile(r"image_0?([0-3])")
@@ -109,7 +106,7 @@ def read(path: Path, context: ReadContext) -> Recording:
         if stamp_ns is None:
             read_cloud = partial(clouds.reject, file, "has no stamp")
         sources.append(CloudSource(file.name, read_cloud, stamp_ns))
-    notes = Source(str(path), format="KITTI", warnings=warnings, stamp_azimuth=_STAMP_AZIMUTH)
+    notes = Source(str(path), format="KITTI", warnings=warnings, stamp_azimuth=0.0)
     if scans == _RAW:
         notes.spin_direction = "clockwise"
     return clouds.build_recording(sources, notes, context, images=pictures)
@@ -172,7 +169,7 @@ def _read_pose_file(folder: Path, calibration: Calibration) -> tuple[list[Float]
 
 
 def _read_rows(path: Path) -> list[Float]:
-    numbers = parse_numbers(table.iter_text_lines(path), _MAX_POSES, range(12), path)
+    numbers = parse_numbers(table.iter_text_lines(path), 10_000_000, range(12), path)
     try:
         return [pose_from_row(row) for row in numbers]
     except ValueError as error:
@@ -248,7 +245,7 @@ def _to_projection(numbers: Float) -> Float:
 
 def _read_entries(path: Path) -> dict[str, Float]:
     """Numbers by the key before the colon; other lines are skipped."""
-    text = read_bytes(path, _MAX_CALIBRATION).decode("ascii", "replace")
+    text = read_bytes(path, 1 << 20).decode("ascii", "replace")
     out = {}
     for line in text.splitlines():
         name, _, numbers = line.partition(":")

@@ -25,9 +25,7 @@ EXTENSIONS, MAGIC = (".las", ".laz"), b"LASF"
 _BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points and bytes read at once
 _MAX_POINTS_PER_BYTE, _MIN_POINT_LIMIT = 20, 10_000_000  # compressed points take a byte or more
 _HEADER = 227  # bytes of the smallest header
-_VLR = 54  # bytes of the smallest variable length record
 _COMPRESSED = 0xC0  # bits of the point format
-_MIN_CHUNK = 20  # bytes: the first point of a chunk is not compressed
 SCALE = 0.0001  # m, coordinate step of written files
 MAX_INTEGER = 2**31 - 1  # of a coordinate in steps
 
@@ -102,11 +100,13 @@ def _check_header(path: Path) -> None:
         if len(head) < _HEADER or head[:4] != MAGIC:
             raise InputError("is no LAS file", where=str(path))
         header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
-        if not header_size + _VLR * extras <= start <= size:
+        # a variable length record has at least 54 bytes
+        if not header_size + 54 * extras <= start <= size:
             raise InputError("is damaged: its header", where=str(path))
         if kind & _COMPRESSED:
             import_extra("lazrs", path)
-        if kind & _COMPRESSED and _count_chunks(file, start, size) > size // _MIN_CHUNK:
+        # the first point of a chunk, of 20 bytes, is not compressed
+        if kind & _COMPRESSED and _count_chunks(file, start, size) > size // 20:
             raise InputError("is damaged: its table of chunks", where=str(path))
 
 

@@ -36,7 +36,6 @@ _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
     "zstd": zstd.ZstdDecompressor,
 }
 _MAX_RATIO, _MIN_LIMIT = 300, 512 << 20  # output of a bag: times its size; bytes
-_PIECE = 1 << 20  # bytes
 _TABLES = ("topics", "messages", "schema", "message_definitions")
 _STEP_INTERVAL = 1000  # virtual machine steps between two calls of the progress handler
 _STEPS_PER_BYTE = 30  # a row takes about 20 steps, and has at least as many bytes
@@ -102,7 +101,7 @@ def decompress_file(path: Path, out: Path) -> bool:
     with InputFile(path) as source, zstd.open(source, "rb") as stream, out.open("wb") as file:
         limit = max(_MAX_RATIO * source.size, _MIN_LIMIT)
         try:
-            while piece := stream.read(_PIECE):
+            while piece := stream.read(1 << 20):
                 file.write(piece)
                 if file.tell() > limit:
                     what = f"decompresses to more than {_MAX_RATIO} times its size"

@@ -209,18 +209,16 @@ def _list_topics(channels: list[Channel]) -> str:
 
 
 def _describe_topic(channel: Channel, use: str | None, tilting: set[str]) -> dict[str, Any]:
-    why = "not used" if use is None else f"read for {use}"
     if channel.n_messages == 0:
         why = "empty"
-    elif use is None and channel.type in (*SCAN_TYPES, ODOMETRY, TF, ROS1_TF):
-        if fault := find_fault(channel):
-            why = fault
-        elif channel.topic in tilting:
-            why = "not for the map: its laser tilts"
-        elif channel.type == POINT_CLOUD:
-            why = "not used: the laser scans are (name it to use it instead)"
-        elif channel.type in SCAN_TYPES:
-            why = "not used: others are named"
+    elif use is not None:
+        why = f"read for {use}"
+    elif channel.type not in (*SCAN_TYPES, ODOMETRY, TF, ROS1_TF):
+        why = "not used"
+    elif channel.topic in tilting:
+        why = "not for the map: its laser tilts"
+    else:
+        why = find_fault(channel) or "not used: others are (read.topic names it)"
     return {
         "topic": channel.topic,
         "type": channel.type,

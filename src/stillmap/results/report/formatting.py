@@ -3,7 +3,7 @@
 import math
 
 # entries of a recording's notes that are angles in rad
-_ANGLES = {"angle_step", "bearings", "pitch", "roll", "start_angle", "theta", "yaw"}
+_ANGLES = {"angle_step", "pitch", "roll", "start_angle", "theta", "yaw"}
 
 
 def format_share(share: float) -> str:
