@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 from stillmap.core.array_folder import (
     count_rows,
@@ -43,7 +43,7 @@ _ARRAYS = (
 _MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
 _Count = Annotated[int, Field(ge=0, lt=1 << 60)]
 _Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
-_Matrix = list[list[float]]
+_Matrix = list[list[FiniteFloat]]
 
 
 @dataclass
@@ -53,7 +53,7 @@ class _CameraHeader:
     height: _Pixels
     K: _Matrix | None
     model: str
-    distortion: list[float]
+    distortion: list[FiniteFloat]
     T_base_camera: _Matrix | None
 
 
