@@ -104,18 +104,6 @@ def test_old_cells_must_have_been_seen_again():
     )
 
 
-def test_old_cells_near_walls_or_what_came_instead_do_not_count():
-    near = np.array([[1.8, 0.85, 1.8, 0.86]])  # 17 cm from two of them, so to say
-    s = score_changes(grid_with([]), MOVED, TEN, np.concatenate([WALLS, near]), HERE)
-    assert s.old_cells == 2
-    instead = [MOVED[0], stay(2.3, 1.0, 4.5, None, 1)]
-    s = score_changes(grid_with([]), instead, looks(instead, list(range(10))), WALLS, HERE)
-    assert (s.new_cells, s.old_cells) == (4, 4)  # its faces are 25 cm away
-    nearer = [MOVED[0], stay(2.2, 1.0, 4.5, None, 1)]
-    s = score_changes(grid_with([]), nearer, looks(nearer, list(range(10))), WALLS, HERE)
-    assert (s.new_cells, s.old_cells) == (4, 0)
-
-
 def test_the_frame_of_the_map_does_not_matter():
     T_world_map = se2.matrix(5.0, -3.0, 2.2)
     origin = tuple(se2.parameters(se2.inverse(T_world_map)))

@@ -15,7 +15,6 @@ from model_surface import (
     TextureRecord,
     TrueImages,
     distance_to_mesh,
-    find_visible_samples,
     look_up_texture_source,
     sample_surface,
     score_surface,
@@ -108,27 +107,6 @@ def test_texture_shows_what_the_pictures_do() -> None:
     assert np.mean(painted == 4) == pytest.approx(0.25, abs=0.01)
     assert np.mean(painted == NOTHING) == pytest.approx(0.125, abs=0.01)
     assert np.mean(painted == -1) == pytest.approx(0.625, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("z", "turned", "off", "share"),
-    [
-        (0.0, False, 0.0, 0.75),
-        (0.04, False, 0.0, 0.75),
-        (0.0, True, 0.0, 0.0),  # the picture sees its back
-        (0.0, False, -0.5, 0.0),  # something stands before it
-        (0.4, False, 0.0, 0.0),  # where nothing is
-    ],
-)
-def test_what_pictures_see_without_movers(z: float, turned: bool, off: float, share: float) -> None:
-    mask = np.zeros((30, 40), np.uint16)
-    mask[:, :10] = 5
-    vertices, faces = _floor((-2, 2), (-1.5, 1.5), z)
-    record = _record(vertices, faces[:, ::-1] if turned else faces)
-    free = find_visible_samples(
-        record, sample_surface(vertices, record.faces, 20_000), _pictures(mask, off), T_WORLD_MAP
-    )
-    assert free.mean() == pytest.approx(share, abs=0.02)
 
 
 # a box of 2 x 1 x 1 m that drives along x at 1 m/s
@@ -232,14 +210,3 @@ def test_distances_to_corners_edges_and_inside() -> None:
     points = np.array([(1.0, 0.5, 0.3), (-0.3, 0.5, 0.4), (2.3, 1.4, 0.0), (0.5, 0.5, 0.0)])
     distances = distance_to_mesh(points, *SQUARE, 0.1)
     assert np.allclose(distances, [0.3, 0.5, 0.5, 0.0])
-
-
-def test_samples_are_as_dense_everywhere() -> None:
-    vertices, faces = SQUARE
-    vertices = np.vstack([vertices, vertices + np.array([5.0, 0, 0])])
-    faces = np.vstack([faces, [(4, 5, 6)]]).astype(np.int32)  # half as large as the square
-    samples = sample_surface(vertices, faces, 3000)
-    assert np.bincount(samples.face).tolist() == [1000, 1000, 1000]
-    of_square = samples.points[samples.face < 2]
-    assert np.allclose(of_square.mean(axis=0), (1.0, 0.5, 0.0), atol=0.03)
-    assert np.allclose(of_square.std(axis=0), (2 / 12**0.5, 1 / 12**0.5, 0.0), atol=0.02)

@@ -1,11 +1,8 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
-from pairs import errors_of, known_relations, name_of, near_pairs, relations_beside, relations_of
+from pairs import errors_of, near_pairs
 
 from stillmap.core import se2
-from stillmap.results.eval.readers import read_relations
 
 
 def line(T: int) -> np.ndarray:
@@ -39,16 +36,3 @@ def test_errors_are_those_of_the_displacements() -> None:
     assert errors.translation.max == pytest.approx(0.25)
     assert errors.translation.mean == pytest.approx(0.25 * across)
     assert errors.rotation.max < 1e-9
-
-
-def test_relations_of_a_log_lie_beside_it(tmp_path: Path) -> None:
-    log = tmp_path / "floor.3.clf.gz"
-    rows = relations_of(np.array([10**9, 2 * 10**9]), line(1), np.array([0]), np.array([1]))
-    np.savetxt(tmp_path / "floor.3.pseudo.relations", rows)
-    assert name_of(log) == "floor.3"
-    assert relations_beside(log).name == "floor.3.pseudo.relations"
-    found = known_relations(log, np.array([10**9]))
-    np.testing.assert_allclose(found, [[1, 2, 0, 0, 0, 0, 0, np.pi]], atol=1e-12)
-    np.savetxt(tmp_path / "floor.3.relations", rows)
-    assert relations_beside(log).name == "floor.3.relations"
-    np.testing.assert_array_equal(read_relations(relations_beside(log)), found)

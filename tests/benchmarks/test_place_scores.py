@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_up_place import write_place
-from place_cells import collect_cells
 from place_changes import ChangeScores
 from place_scores import PlaceScores, score_place
 from place_truth import SessionTruth, load_session_truth
@@ -136,25 +135,6 @@ def test_changes_of_another_date_are_neither_found_nor_right(place, truth) -> No
     assert changes.events_found > 0
     assert changes.dates_right < 0.3
     assert changes.f1 < 0.8
-
-
-@pytest.mark.slow
-def test_cells_of_changes_take_the_place_of_boxes(place: Path, truth: SessionTruth) -> None:
-    cells = collect_cells(truth, [0, 1, 2])
-    T = np.linalg.inv(truth.T_world_session[0])
-    ids, points = [], []
-    for number, change in enumerate(truth.changes):
-        differ = cells.surfaces[change.between[0]] != cells.surfaces[change.between[1]]
-        xy = cells.lattice.centres()[differ]
-        points.append(xy @ T[:2, :2].T + T[:2, 2])
-        ids.append(np.full(len(xy), number))
-    ids, points = np.concatenate(ids), np.concatenate(points)
-    np.savez(place / "changes.npz", change=ids, xy=points)
-    changes = changes_of(score_place(place, truth.folder))
-    assert changes.source == "cells"
-    assert changes.f1 == 1.0
-    np.savez(place / "changes.npz", change=ids, xy=points + 0.3)
-    assert changes_of(score_place(place, truth.folder)).f1 < 0.5
 
 
 def test_ghosts_and_missing_walls_show_in_the_map(place: Path, truth: SessionTruth) -> None:

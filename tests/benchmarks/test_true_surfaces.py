@@ -85,16 +85,6 @@ def test_nearest_places_of_faces_and_ground() -> None:
     )
 
 
-def test_distance_to_a_slope_is_at_right_angles() -> None:
-    slope = Ground(np.array([0.1, 0.0]), np.empty((0, 4)), 0.0)
-    nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
-    none = _solid(BOX, (1.0, 1.0), (0.0, 1.0)).select(np.zeros(1, bool))
-    plane = StaticSurfaces(nothing, none, slope, None)
-    distance, places = project_to_static(plane, np.array([[10.0, 3.0, 2.0]]))
-    assert np.allclose(distance, 1.0 / np.sqrt(1.01))
-    assert np.allclose(places[:, 2], 0.1 * places[:, 0])
-
-
 def test_movers_go_on_evenly_between_scans_but_for_leaps() -> None:
     pose = np.zeros((3, 2, 4))
     pose[:, 0, 0] = [0.0, 1.0, 2.0]

@@ -61,20 +61,6 @@ def test_a_reset_begins_again_at_the_origin() -> None:
     assert np.hypot(*got[again, :2].T).max() > 1.0
 
 
-@pytest.mark.slow
-def test_nothing_but_the_odometry_changes_when_it_lies() -> None:
-    plain = short()
-    lies = {"stall_rate": 6.0, "stall_time": 3.0, "resets": 2}
-    lying = short(odometry=lies)
-    np.testing.assert_array_equal(plain.recording.points, lying.recording.points)
-    np.testing.assert_array_equal(plain.truth.T_world_base, lying.truth.T_world_base)
-    a, b = plain.recording.T_odom_base, lying.recording.T_odom_base
-    assert a is not None
-    assert b is not None
-    same = np.abs(moves(a) - moves(b)).max(axis=1) < 1e-9
-    assert 0.4 < same.mean() < 0.95
-
-
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2, 3)])
 def test_a_carried_robot_goes_on_elsewhere_and_odometry_knows_nothing(seed: int) -> None:
     perfect = {"wheel_radius_error": 0.0, "wheel_base_error": 0.0, "translation_noise": 0.0,

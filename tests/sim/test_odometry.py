@@ -29,18 +29,6 @@ def test_perfect_wheels_give_the_true_motion() -> None:
     np.testing.assert_allclose(odometry, se2.inverse(poses[:1]) @ poses, atol=1e-9)
 
 
-def test_a_wheel_that_reads_long_turns_a_straight_line_into_a_circle() -> None:
-    poses = se2.matrix(np.arange(0, 100.05, 0.1), 0.0, 0.0)
-    options = dataclasses.replace(PERFECT, wheel_radius_error=0.01)
-    end = se2.parameters(simulate_odometry(poses, options, np.random.default_rng(3)))[-1]
-    left, right = 0.01 * np.random.default_rng(3).standard_normal(2)
-    turned = (right - left) / 0.4 * 100.0
-    assert end[2] == pytest.approx(se2.wrap(turned), abs=1e-9)
-    radius = (100.0 + 50.0 * (left + right)) / turned
-    assert end[0] == pytest.approx(radius * np.sin(turned), abs=1e-6)
-    assert end[1] == pytest.approx(radius * (1 - np.cos(turned)), abs=1e-6)
-
-
 @pytest.mark.parametrize("steps", [100, 1000])
 def test_noise_does_not_depend_on_the_scan_rate(steps: int) -> None:
     poses = se2.matrix(np.linspace(0, 50, steps + 1), 0.0, 0.0)

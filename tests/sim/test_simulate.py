@@ -66,32 +66,6 @@ def test_another_laser_and_odometry_leave_everybody_where_they_were() -> None:
     np.testing.assert_array_equal(a.recording.points, c.recording.points)
 
 
-@pytest.mark.slow
-def test_static_hits_lie_on_walls(
-    populated: Simulation, wall_distance: Distance, end_points: EndPoints
-) -> None:
-    xy, _ = end_points(populated)
-    truth = populated.truth
-    distance = wall_distance(xy[truth.static][::5], truth.walls)
-    sigma = populated.scene.laser.range_noise
-    assert distance.max() < 5.5 * sigma
-    # a wall that is hit straight on shows the whole noise, one at a slant less of it
-    assert 0.3 * sigma < np.sqrt(np.mean(distance**2)) < sigma
-
-
-@pytest.mark.slow
-def test_hits_on_movers_lie_on_that_mover(any_run: Simulation, end_points: EndPoints) -> None:
-    xy, scan = end_points(any_run)
-    mover = any_run.truth.mover
-    hit = mover >= 0
-    centre = any_run.truth.movers[scan[hit], mover[hit], :2]
-    off = np.hypot(*(xy[hit] - centre).T)
-    sigma = any_run.scene.laser.range_noise
-    assert off.max() < 0.28 + 0.2 + 5 * sigma  # half a step and a foot, or half a body
-    assert np.quantile(off, 0.95) < 0.4
-    assert off.mean() > 0.1
-
-
 def test_nobody_walks_through_walls_or_the_robot(
     any_run: Simulation, wall_distance: Distance
 ) -> None:
