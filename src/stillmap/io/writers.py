@@ -161,7 +161,7 @@ def find_writer(path: Path, name: str | None = None) -> Writer:
 
 
 def require_fit(path: Path, writer: Writer, dimension: int, sensors: int) -> None:
-    """Refuse recordings that a format cannot hold, before they are read.
+    """Refuse recordings that a format cannot hold.
 
     Raises:
         InputError: it has too many dimensions or sensors.
@@ -171,7 +171,7 @@ def require_fit(path: Path, writer: Writer, dimension: int, sensors: int) -> Non
         fault = f"{writer.max_dimension}D at most, it is {dimension}D"
         raise InputError(f"{what}: {fault}", where=str(path))
     if writer.max_sensors is not None and sensors > writer.max_sensors:
-        fault = f"at most {writer.max_sensors} sensors, it has {sensors}"
+        fault = f"it has {sensors} sensors, the format holds {writer.max_sensors}"
         raise InputError(f"{what}: {fault}", where=str(path))
 
 
@@ -197,6 +197,7 @@ def write(
     require_free(path, writer.marker, overwrite)
     if not recording.n_scans:
         raise InputError("holds no scan: there is nothing to write")
+    require_fit(path, writer, recording.dimension, len(recording.T_base_sensor))
     lost = [
         f"its {words} are left out"
         for field, words in _OPTIONAL_FIELDS.items()

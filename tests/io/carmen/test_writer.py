@@ -115,13 +115,13 @@ def test_unsupported_recordings(tmp_path):
     empty[1:3] = 0
     none = dataclasses.replace(recording, offset=empty)
     for one, words in (
-        (three, "two lasers, the recording has 3"),
+        (three, "it has 3 sensors, the format holds 2"),
         (uneven, "scans of 179 to 181 beams"),
         (mixed, "one way in some scans"),
         (none, "scans of 0 to"),
     ):
         with pytest.raises(InputError, match=words):
-            writer.write_log(one, tmp_path / "b.log")
+            writers.write(one, tmp_path / "b.log")
     assert [path.name for path in tmp_path.iterdir()] == ["a.log"]
 
 

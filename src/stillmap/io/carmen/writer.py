@@ -146,9 +146,6 @@ def _format_pose(pose: Float) -> str:
 
 def _choose_format(recording: Recording) -> LogFormat:
     n_lasers = len(recording.T_base_sensor)
-    if n_lasers > 2:
-        what = f"CARMEN logs hold two lasers, the recording has {n_lasers}"
-        raise InputError(what, hint=_ALTERNATIVE)
     counts = np.diff(recording.offset)
     for number in range(n_lasers):
         _require_one_count(counts[recording.sensor == number])

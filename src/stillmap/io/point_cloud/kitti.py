@@ -22,7 +22,7 @@ from stillmap.io import cameras, images
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
 from stillmap.io.point_cloud.clouds import Cloud, CloudSource
-from stillmap.io.point_cloud.origin import require_single_sensor, scan_hits, sensor_poses
+from stillmap.io.point_cloud.origin import scan_hits, sensor_poses
 from stillmap.io.point_cloud.table import Field, TableLayout, parse_numbers
 from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
 from stillmap.io.scan_files import assign_rows, list_files, read_times
@@ -319,9 +319,8 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     The recorded poses, else the odometry, become `poses.txt`.
 
     Raises:
-        InputError: `path` is taken or cannot be written, or there are several sensors.
+        InputError: `path` is taken or cannot be written.
     """
-    require_single_sensor(recording, str(path))
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
     T = sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))

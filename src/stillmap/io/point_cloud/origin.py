@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import finite_rows
-from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.rigid_transforms import MAX_TRANSLATION, embed_in_3d
 
@@ -88,18 +87,6 @@ def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     # column by column: np.median(axis=0) takes several times as long
     middle = np.array([np.median(column) for column in finite.T])
     return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
-
-
-def require_single_sensor(recording: Recording, where: str) -> None:
-    """Refuse recordings of several sensors, for formats that hold one.
-
-    Raises:
-        InputError: there are several sensors.
-    """
-    n = len(recording.T_base_sensor)
-    if n != 1:
-        what = f"cannot be written: the recording has {n} sensors, the format holds one"
-        raise InputError(what, where=where)
 
 
 def sensor_poses(

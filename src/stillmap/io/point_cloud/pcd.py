@@ -23,7 +23,7 @@ from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
 from stillmap.io.point_cloud.clouds import Cloud
-from stillmap.io.point_cloud.origin import Origin, require_single_sensor, scan_hits, sensor_poses
+from stillmap.io.point_cloud.origin import Origin, scan_hits, sensor_poses
 from stillmap.io.point_cloud.table import Columns, Field, TableLayout
 from stillmap.io.rigid_transforms import pose_from_quaternion, quaternion_from_pose
 
@@ -221,9 +221,8 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     stamp.
 
     Raises:
-        InputError: `path` is taken or cannot be written, or there are several sensors.
+        InputError: `path` is taken or cannot be written.
     """
-    require_single_sensor(recording, str(path))
     T = sensor_poses(recording, recording.T_recorded_base)
     with atomic_folder(Path(path), MARKER, overwrite) as folder:
         repeats = 0
