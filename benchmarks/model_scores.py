@@ -19,10 +19,11 @@ from model_readers import CameraSimulation
 from model_surface import score_surface, score_texture
 from numpy.typing import NDArray
 
+from stillmap.core.errors import InputError
 from stillmap.core.json import to_jsonable
 from stillmap.results.eval import trajectory
 from stillmap.results.eval.trajectory import read_paired_poses
-from stillmap.results.reader import require_model, require_there
+from stillmap.results.reader import require_there
 from stillmap.rig.trajectory import lift_poses
 from stillmap.sim.truth import load_truth
 
@@ -50,7 +51,10 @@ def score_model(result: Path, truth_folder: Path, max_distance: float) -> dict[s
     seen = model_readers.read_camera_simulation(truth_folder)
     T_world_map = _align(result, seen)
     scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
-    glb = model_readers.read_glb(require_model(result))
+    path = result / "mesh.glb"
+    if not path.is_file():
+        raise InputError("holds no model", where=str(result), hint="mesh.enabled=true makes it")
+    glb = model_readers.read_glb(path)
     standing, places = seen.image_truth.standing, seen.observed_places(max_distance)
     surface = score_surface(glb.vertices, glb.faces, standing, places, T_world_map)
     scores["surface"] = surface.to_dict()

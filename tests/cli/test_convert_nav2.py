@@ -38,38 +38,25 @@ BLOCK = feature(polygon(SQUARE), action="block")
         ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
         (b"\xff\xfe", "is not JSON"),
-        ("[]", "is no GeoJSON FeatureCollection"),
-        (json.dumps(BLOCK), "is no GeoJSON FeatureCollection"),
-        ('{"type": "FeatureCollection", "features": {}}', "is no GeoJSON FeatureCollection"),
-        (collection(BLOCK, 7), "feature 2: is no Feature"),
-        (collection(feature(polygon(SQUARE))), "feature 1: has no action (a property: erase, bl"),
-        (collection(feature(polygon(SQUARE), action="erased")), "do you mean 'erase'?"),
-        (collection(feature(polygon(SQUARE), action=["erase"])), "has the action ['erase']"),
-        (collection(feature(None, action="block")), "feature 1: has no geometry (Polygon or Mult"),
-        (collection(feature({"type": "Point"}, action="block")), "feature 1: is a 'Point' (Polyg"),
+        ("[]", "(a GeoJSON FeatureCollection)"),
+        (json.dumps(BLOCK), "(a GeoJSON FeatureCollection)"),
+        (collection(BLOCK, feature(polygon(SQUARE))), "feature 2: is damaged: properties.action"),
+        (collection(feature(polygon(SQUARE), action="erased")), "'erase', 'block', 'keepout' or"),
+        (collection(feature({"type": "Point"}, action="block")), "'Polygon' or 'MultiPolygon'"),
         (
             collection(BLOCK, feature(polygon(SQUARE[:-1]), action="block", name="dock")),
-            "feature 2 'dock': has no usable coordinates: a ring",
+            "feature 2 'dock': has a ring whose last position is not its first",
         ),
-        (collection(feature(polygon(SQUARE[:2]), action="block")), "less than four positions"),
-        (collection(feature(polygon([]), action="block")), "not nested"),
-        (collection(feature(polygon(), action="block")), "not nested"),
-        (collection(feature(polygon(SQUARE, kind="MultiPolygon"), action="block")), "coordinates"),
-        (collection(feature(polygon([["0", "1"]] * 4), action="block")), "than a number"),
-        (collection(feature(polygon([[True, 1]] * 4), action="block")), "than a number"),
-        (collection(feature(polygon([[0], [1], [1], [0]]), action="block")), "without x and y"),
-        (collection(feature(polygon([[0, 1], [2]] * 2), action="block")), "no usable coordinates"),
-        (collection(feature(polygon([[2e9, 1]] * 4), action="block")), "kilometres"),
+        (collection(feature(polygon(SQUARE[:2]), action="block")), "rings of four positions"),
+        (collection(feature(polygon(), action="block")), "rings of four positions"),
+        (collection(feature(polygon([["0", "1"]] * 4), action="block")), "valid number"),
+        (collection(feature(polygon([[0, 1], [2]] * 2), action="block")), "0.0.1: List should"),
+        (collection(feature(polygon([[10**400, 1]] * 4), action="block")), "rings of four"),
         (collection(feature(polygon([[np.nan, 1]] * 4), action="block")), "is not JSON"),
-        (collection(feature(polygon([[np.inf, 1]] * 4), action="block")), "is not JSON"),
-        (collection(feature(polygon([[10**400, 1]] * 4), action="block")), "coordinates"),
-        (collection(feature(polygon(SQUARE), action="speed")), "has no property speed"),
+        (collection(feature(polygon(SQUARE), action="speed")), "None is no speed limit"),
         (collection(feature(polygon(SQUARE), action="speed", speed="fast")), "'fast' is no speed"),
-        (collection(feature(polygon(SQUARE), action="speed", speed=0)), "0 is no speed limit"),
         (collection(feature(polygon(SQUARE), action="speed", speed=True)), "True is no speed"),
-        (collection(feature(polygon(SQUARE), action="speed", speed="0%")), "'0%' is no speed"),
         (collection(feature(polygon(SQUARE), action="speed", speed="nan%")), "is no speed limit"),
-        (collection(feature(polygon(SQUARE), action="speed", speed=10**400)), "is no speed limit"),
         (
             collection(*(feature(polygon(SQUARE), action="speed", speed=s) for s in ("50%", 1))),
             "feature 1: has a speed limit in percent",
@@ -209,7 +196,7 @@ def test_many_corners_on_many_rows_stay_in_memory():
     import tracemalloc
 
     from stillmap.core.grid_map import GridMap
-    from stillmap.results.export.zone_cells import cells_inside
+    from stillmap.results.export.zones import cells_inside
 
     n = 10_000
     x = np.linspace(0.0, 50.0, n)

@@ -43,10 +43,9 @@ def test_seconds_are_those_of_the_text():
     [
         ("", "", "no rows"),
         ("# only words\n\n", "", "no rows"),
-        ("0 1 2 3\n1 2 3\n", ":2", "3 columns"),
-        ("0 1 2 3\n\n# x\n1 2 three 4\n", ":4", "not a number"),
-        ("0 1 2 3\n1 nan 2 3\n", ":2", "not finite"),
-        ("0 1 2 3\n1 2 inf 3\n", ":2", "not finite"),
+        ("0 1 2 3\n1 2 3\n", ":2", "4 finite"),
+        ("0 1 2 3\n\n# x\n1 2 three 4\n", ":4", "4 finite"),
+        ("0 1 2 3\n1 nan 2 3\n", ":2", "4 finite"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", ":2", "7 columns"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 nan\n", ":2", "not finite"),
         ("1 2\n", ":1", "2 columns"),
@@ -76,7 +75,7 @@ def test_files_that_are_no_text(tmp_path):
 def test_relations_have_eight_columns(tmp_path):
     path = tmp_path / "r"
     path.write_text("0 1 2 3 4 5 6 7  # kept\n0 1 2 3\n")
-    with pytest.raises(InputError, match="4 columns, not 8") as caught:
+    with pytest.raises(InputError, match="no row of 8") as caught:
         read_relations(path)
     assert caught.value.where == f"{path}:2"
 

@@ -11,8 +11,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from small_place import BOX, CELL, CHAIR, DOOR, OPEN, ORIGIN, SIZE, make_place
 
+from stillmap.results.colors import KIND_COLORS
 from stillmap.results.reader import read_grid
-from stillmap.results.report.place import KIND_COLORS, PlacePictures
+from stillmap.results.report.place_pictures import PlacePictures
 from stillmap.results.timeline import read_timeline
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)

@@ -164,7 +164,7 @@ def _daily(names):
 def test_labels_do_not_cover_each_other(place):
     timeline = read_timeline(place)
     changes = [timeline.changes[k] for k in (0, 2, 3)]
-    marks = place_marks(changes, MapView((-4.0, -3.0, 4.0, 3.0), (800, 600), False))
+    marks = place_marks(changes, MapView((-4.0, -3.0, 4.0, 3.0), (800, 600)))
     low = np.array([(one.x, one.y - marks.font_size) for one in marks.marks])
     high = low + np.array([2 * marks.font_size, marks.font_size])
     for a in range(3):
@@ -214,7 +214,7 @@ def test_merge_writes_the_report(merged):
 
 
 def test_map_as_of_the_last_session_is_the_map(merged):
-    from stillmap.results.report.place import PlacePictures
+    from stillmap.results.report.place_pictures import PlacePictures
 
     timeline = read_timeline(merged)
     pictures = PlacePictures(read_grid(merged), timeline)

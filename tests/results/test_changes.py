@@ -4,7 +4,6 @@ import base64
 import dataclasses
 import io
 import json
-import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -213,15 +212,6 @@ def test_the_table(changed, changes_section):
     assert "1 changed place: 1 came." in changes_section(one)
 
 
-def test_report_names_the_map_state(changed, changes_section):
-    assert "last observed state" in changes_section(changed)
-    output = dataclasses.replace(changed.options.output, map_state="majority")
-    options = dataclasses.replace(changed.options, output=output)
-    most = changes_section(dataclasses.replace(changed, options=options))
-    assert "state that it held longest" in most
-    assert "last observed state" not in most
-
-
 def test_changed_cells_are_drawn_in_the_colors_of_their_kinds(changed, changes_section):
     picture, marks = Section(changes_section(changed)).pictures
     assert picture.size == marks.size
@@ -231,18 +221,6 @@ def test_changed_cells_are_drawn_in_the_colors_of_their_kinds(changed, changes_s
     found = dict(zip(map(tuple, colours.tolist()), counts.tolist(), strict=True))
     # a pixel is a cell: the map is small
     assert found == {COLOURS[1]: 6, COLOURS[2]: 12, COLOURS[3]: 36}
-
-
-def test_numbers_are_drawn_beside_their_places(changed, changes_section):
-    section = changes_section(changed)
-    texts = re.findall(r'<text x="([\d.]+)" y="([\d.]+)">(\d+)</text>', section)
-    assert [number for *_, number in texts] == ["1", "2", "3"]
-    marks = np.asarray(Section(section).pictures[1])
-    kinds = [1, 3, 2]
-    for (x, y, _), kind in zip(texts, kinds, strict=True):
-        row, column = np.nonzero(marks == kind)
-        assert abs(float(y) - row.mean() - 0.5) < 1.5
-        assert float(x) > column.max()
 
 
 def test_table_lists_the_largest_changes(changed, result, changes_section, monkeypatch):

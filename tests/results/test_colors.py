@@ -14,14 +14,6 @@ def test_color_by_p_static():
     assert len(set(shown[1].tolist())) == 1  # grey
 
 
-def test_heights_beyond_the_limits_are_clamped():
-    shown = colors.color_by_height(np.array([-9.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0)
-    assert (shown[0] == shown[1]).all()
-    assert (shown[3] == shown[4]).all()
-    assert len(np.unique(shown, axis=0)) == 3
-    assert (colors.color_by_height(np.zeros(2), 0.0, 0.0) == shown[1]).all()
-
-
 def test_colors_of_successive_ids_differ():
     shown = colors.color_by_id(range(40)).astype(int)
     assert np.abs(np.diff(shown, axis=0)).sum(axis=1).min() > 100

@@ -178,9 +178,9 @@ def test_a_graph_in_3d_is_read_again_by_us_and_by_gtsam(tmp_path):
     [
         ("VERTEX_SE2 x 0 0 0", "line 12"),
         ("VERTEX_SE2 99 0 nan 0", "line 12"),
-        ("EDGE_SE2 0 77 1 0 0 1 0 0 1 0 1", "no vertex"),
+        ("EDGE_SE2 0 77 1 0 0 1 0 0 1 0 1", "has no vertex"),
         ("EDGE_SE2 0 3 1 0 0 1 0 0 -1 0 1", "positive definite"),
-        ("EDGE_SE3:QUAT 0 3 1", "among vertices"),
+        ("EDGE_SE3:QUAT 0 3 1", "expected 9 finite"),
     ],
 )
 def test_damage_is_named(tmp_path, graph, line, words):

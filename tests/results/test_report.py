@@ -2,7 +2,6 @@ import base64
 import dataclasses
 import hashlib
 import io
-import itertools
 import re
 
 import numpy as np
@@ -13,14 +12,12 @@ from report_page import Page
 from stillmap.pipeline.quality import Quality, describe_quality
 from stillmap.results.colors import ORANGE
 from stillmap.results.map_server import write_map_server
-from stillmap.results.report import formatting
-from stillmap.results.report.estimation import curve_of, round_down
+from stillmap.results.report.estimation import curve_of
 from stillmap.results.report.figures import UNKNOWN, VEIL_ALPHA, VIOLET
 from stillmap.results.report.page import render_report
 from stillmap.slam.mount_calibration import Calibration, Parameter
 
 # what a reader finds in no dictionary, or only in the code
-JARGON = r"\bnats?\b|\blooks\b|\b[em]_step\b|\brad\b|HMM|posterior|responsibilit"
 
 
 @pytest.fixture(scope="module")
@@ -79,31 +76,6 @@ def test_text_from_files_is_escaped(page):
         "a <b>bold</b> & 'quoted' note",
     ):
         assert foreign in text
-
-
-def test_headline_figures(page):
-    text = "|".join(page.text)
-    for value in ("60", "12.4 %", "7.3 s", "2"):
-        assert f"|{value}|" in text
-    text = "".join(page.text)
-    assert "from 60 scans over 12 s" in text
-    assert "97 MB of memory" in text
-    assert "Of 10,860 beams" in text
-    assert "lines 203, 204," in text
-    assert "15 more" in text
-
-
-def test_words_are_plain(html):
-    text = re.sub(r"<(style|script)>.*?</\1>", "", html, flags=re.DOTALL)
-    text = " ".join(Page(text).text)
-    assert re.findall(JARGON, text, re.IGNORECASE) == []
-
-
-def test_headings_are_in_order(page):
-    levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch(r"h[1-6]", tag)]
-    assert levels[0] == 1
-    assert levels.count(1) == 1
-    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
 
 
 def test_images_have_alt_texts_and_show_the_maps(page, result):
@@ -222,13 +194,6 @@ def test_curve_has_gaps_where_values_are_not_finite():
     assert len(curve_of([1, 2], [-5e9, -5e9], best=1).y_ticks) > 1
 
 
-@pytest.mark.parametrize(
-    ("value", "rounded"), [(1.0, 1.0), (4.9, 2.0), (73.0, 50.0), (0.5, 0.5), (0.0019, 0.001)]
-)
-def test_round_down(value, rounded):
-    assert round_down(value) == pytest.approx(rounded)
-
-
 def with_likelihoods(result, values):
     first = result.iterations[0]
     records = [
@@ -237,88 +202,11 @@ def with_likelihoods(result, values):
     return dataclasses.replace(result, iterations=records)
 
 
-def test_report_names_iterations_where_the_bound_decreased(result, section):
-    def text(values):
-        html = render_report(with_likelihoods(result, values))
-        return " ".join(section(html, "Likelihood over the iterations").split())
-
-    assert "never decreased" in text([-100, -90, -90])
-    assert "decreased at iteration 3 (by 2.2 %)" in text([-100, -90, -92, -80])
-    assert "decreased at iterations 2, 4 (most at iteration 4, by 3.0 %)" in text(
-        [-100, -101, -100, -103]
-    )
-    assert "There was one iteration." in text([-5])
-    assert "decreased at iteration 3 (by 3.0 %)" in text([-100, float("nan"), -103])
-
-
-def estimated_by(result, estimator):
-    options = dataclasses.replace(result.options, estimator=estimator)
-    return dataclasses.replace(result, options=options)
-
-
-def test_curve_titles_depend_on_the_estimator(result):
-    default = render_report(result)
-    assert "Log likelihood of the observations" in default
-    assert "(5)" not in default
-    for estimator in ("paper", "hit-ratio", "tracker"):
-        printed = render_report(estimated_by(result, estimator))
-        assert "Expected log likelihood, (5)" in printed
-        assert "Log likelihood of the ranges" in printed
-
-
 def test_one_iteration_makes_no_curve(result):
     one = render_report(dataclasses.replace(result, iterations=result.iterations[:1]))
     assert 'class="curve"' not in one
     assert "There was one iteration." in one
     assert render_report(result).count('class="curve"') == 2
-
-
-def test_loop_closures(result, section):
-    def text(loops):
-        html = render_report(dataclasses.replace(result, loops=loops))
-        return section(html, "Likelihood over the iterations")
-
-    assert (
-        "Loop closure: 1 of 4 candidates accepted; "
-        "rejected: explains too little (2), other loops disagree (1)."
-    ) in text(result.loops)
-    assert "Loop closure: 1 of 1 candidates accepted." in text(result.loops[:1])
-    assert "Loop closure" not in text([])
-
-
-def test_one_snapshot_shows_no_evolution(result):
-    assert "Map over the iterations" in render_report(result)
-    one = render_report(dataclasses.replace(result, snapshots=result.snapshots[:1]))
-    assert "Map over the iterations" not in one
-    assert "Part with most dynamic returns" in one
-
-
-@pytest.fixture
-def fitted(section):
-    """A function: the words of the section on fitted parameters."""
-    return lambda result: re.sub(
-        r"\s+",
-        " ",
-        " ".join(Page(section(render_report(result), "What was fitted to this recording")).text),
-    )
-
-
-def test_fitted_parameters(result, fitted):
-    text = fitted(result)
-    assert "87.3 % of the cells in which beams ended are static" in text
-    assert "noise is 1.7 cm" in text
-    assert "0.5 s or less 60.0 % 3 s 30.0 % 45 s or more 10.0 %" in text
-    assert "1 % or less 90.0 % 15 % or more 10.0 %" in text
-    assert "90 % or less 25.0 % 99.8 % or more 75.0 %" in text  # in rising order
-
-
-def test_parameters_that_were_not_fitted_are_not_shown(result, fitted):
-    assert fitted(dataclasses.replace(result, learned={})) == ""
-    static = dataclasses.replace(result, p_static=np.ones_like(result.p_static))
-    assert "only 0 dynamic returns" in fitted(static)
-    assert "or less 60.0 %" not in fitted(static)
-    noiseless = dataclasses.replace(result, learned={**result.learned, "scatter": 0.0})
-    assert "noise" not in fitted(noiseless)
 
 
 @pytest.mark.parametrize(
@@ -345,34 +233,6 @@ def test_likelihoods_that_are_not_finite(result):
     Page(render_report(with_likelihoods(result, [float("nan"), float("-inf"), -3.0])))
 
 
-@pytest.mark.parametrize(
-    ("function", "value", "text"),
-    [
-        ("format_duration", 0.0123, "0.012 s"),
-        ("format_duration", 42.4, "42 s"),
-        ("format_duration", 1.7e-5, "under 1 ms"),
-        ("format_duration", 192.0, "3 min 12 s"),
-        ("format_duration", 59.9, "1 min 0 s"),
-        ("format_duration", 7260.0, "2 h 1 min"),
-        ("format_share", 0.0, "0.0 %"),
-        ("format_share", 0.00123, "0.12 %"),
-        ("format_share", 0.1235, "12.3 %"),
-        ("format_share", float("nan"), "unknown"),
-        ("format_bytes", 45_600_000, "46 MB"),
-        ("format_bytes", 2_345_000_000, "2.35 GB"),
-        ("format_bytes", 0, "unknown"),
-        ("format_number", None, "-"),
-        ("format_clock", 3_723_400_000_000, "1:02:03.4"),
-        ("format_sentence", "a wall, bent", "a wall, bent."),
-        ("format_sentence", "is it?", "is it?"),
-        ("format_scalar", True, "yes"),
-        ("format_scalar", None, "not set"),
-    ],
-)
-def test_numbers_as_text(function, value, text):
-    assert getattr(formatting, function)(value) == text
-
-
 def test_calibration(result):
     yaw, latency = Parameter(0.0, np.pi, 0.002, True), Parameter(0.0, 0.012, 0.008, False)
     found = Calibration([{"theta": yaw}], [False], {"latency": latency}, 35)
@@ -380,11 +240,3 @@ def test_calibration(result):
     assert re.search(r"laser, direction\s+0\.0°\s+180\.0 ± 0\.1°\s+estimated", text)
     assert re.search(r"odometry, delay\s+0\.000 s\s+0\.012 ± 0\.008 s\s+recorded", text)
     assert "upside down" not in text
-
-
-def test_details_of_the_recording(page):
-    text = "".join(page.text)
-    assert "threshold how: 12 m repeats (919 x)" in text
-    assert "start angle: -90°" in text
-    assert "stamp goes back, 2 times: lines 88, 91" in text
-    assert "ignored" not in text

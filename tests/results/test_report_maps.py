@@ -65,7 +65,7 @@ def test_window_contains_every_occupied_cell_of_both_maps(result):
 
 def test_points_are_drawn_at_their_positions():
     points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
-    dots = np.asarray(draw_points(points, MapView((0, 0, 3, 2), (3, 2), False)))
+    dots = np.asarray(draw_points(points, MapView((0, 0, 3, 2), (3, 2))))
     np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stillmap.core.json import to_jsonable, write_json
+from stillmap.core.json import write_json
 from stillmap.core.source import Source
 from stillmap.results.run_json import run_record
 from stillmap.slam.mount_calibration import Calibration, Parameter
@@ -154,8 +154,3 @@ def test_values_of_every_kind_become_json(tmp_path, result):
         "7": None,
         "skipped_unit": "line",
     }
-
-
-def test_jsonable_keeps_the_kind_of_what_json_knows():
-    value = {"a": [True, 1, 1.5, "x", None]}
-    assert json.dumps(to_jsonable(value)) == json.dumps(value)

@@ -5,7 +5,6 @@ import pytest
 
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
-from stillmap.results.viewer import beams as module
 from stillmap.results.viewer.beams import Beams
 from stillmap.slam import SlamOptions, deskew_recording
 
@@ -40,8 +39,8 @@ def test_number_of_beams_is_limited(beams):
     assert all((every.ends == end).all(axis=1).any() for end in seen.ends)
 
 
-def test_dynamic_ends(beams, monkeypatch):
-    """Whatever the blocks, they are the dynamic end points of all scans."""
+def test_dynamic_ends(beams):
+    """They are the dynamic end points of all scans."""
     D = beams.recording.dimension
     views = [beams.scan_view(scan) for scan in range(beams.recording.n_scans)]
     ends = np.concatenate([view.ends[view.p_static < 0.5] for view in views])[:, :D]
@@ -49,8 +48,3 @@ def test_dynamic_ends(beams, monkeypatch):
     some = beams.dynamic_ends(5)
     assert len(some) == 5
     assert all((np.abs(ends - one).max(axis=1) < 1e-5).any() for one in some)
-    if beams.recording.beam_time is None:  # deskewing looks at the neighbours of a scan
-        monkeypatch.setattr(module, "_BLOCK_SCANS", 2)
-        assert beams.dynamic_ends(1000) == pytest.approx(ends, abs=1e-5)
-        monkeypatch.setattr(module, "_MAX_READ", 80)  # one block of three
-        assert 0 < len(beams.dynamic_ends(1000)) < len(ends)

@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stillmap.mesh.texture import TexturedMesh
-from stillmap.results.colors import BACKGROUND, TEAL
+from stillmap.results.colors import BACKGROUND, KIND_COLORS, TEAL
 from stillmap.results.gltf import write_glb
-from stillmap.results.report.place import KIND_COLORS
 from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")

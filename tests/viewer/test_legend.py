@@ -11,7 +11,6 @@ from stillmap.results.viewer.legend import (
     legend_html,
     scale_length,
 )
-from stillmap.results.viewer.scene import read_scene
 
 
 def colors(html):
@@ -33,19 +32,6 @@ def test_legend_names_visible_layers_alone(window):
     for box in window._boxes.values():
         box.value = False
     assert colors(told()) == set()
-
-
-def test_color_map_of_heights_has_numbers(window):
-    html = legend_html(window._layers, "height", is_2d=False)
-    low, high = window._layers.heights
-    shown = [float(one) for one in re.findall(r"<span>(-?[\d.]+)</span>", html)]
-    assert shown == pytest.approx([low + n / 4 * (high - low) for n in range(5)], abs=0.051)
-    assert "height z in m" in html
-
-
-def test_2d_legend_says_what_is_unknown(result_of, opened):
-    flat = opened(read_scene(result_of(2)), None)
-    assert "unknown" in legend_html(flat._layers, "label", is_2d=True)
 
 
 @pytest.mark.parametrize(

@@ -71,10 +71,6 @@ def test_page_is_for_those_who_know_its_address(window):
         assert page.headers["Referrer-Policy"] == "no-referrer"
 
 
-def test_tokens_differ(window, result_of, opened):
-    assert window.url.rpartition("/")[2] not in opened(read_scene(result_of(2)), None).url
-
-
 @pytest.mark.parametrize("packed", ["gzip", "identity"])
 def test_page_has_its_script_and_its_title(window, packed):
     """It is what viser has otherwise; the script comes before all of viser's."""

@@ -12,7 +12,7 @@ from small_place import CHAIR, NAMES, make_place
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
-from stillmap.results.report.place import KIND_COLORS
+from stillmap.results.colors import KIND_COLORS
 from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
@@ -130,23 +130,7 @@ def test_keys_step_through_sessions(window):
     assert [after("Next session") for _ in range(4)] == [1, 2, 3, 3]
 
 
-def test_legend_explains_colors_while_they_are_shown(window):
-    from stillmap.results.viewer.legend import legend_html
-
-    def told():
-        return legend_html(window._layers, "label", True)
-
-    assert "trajectories of the sessions" in told()
-    for words in ("A: appeared", "G: gone", "M: moved", "D: door"):
-        assert words in told()
-    for name in PLACE_LAYERS:
-        window._boxes[name].value = False
-    window.step()
-    assert "sessions" not in told()
-    assert "A: appeared" not in told()
-
-
-@pytest.mark.parametrize("name", ["changes.json", "states.npz", "sessions/monday/trajectory.tum"])
+@pytest.mark.parametrize("name", ["changes.json", "states.npz", "trajectory.tum"])
 def test_damaged_place_is_refused(place, name):
     (place / name).write_bytes(b"{")
     with pytest.raises(InputError, match=Path(name).name):

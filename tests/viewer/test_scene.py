@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.results.viewer.nodes import default_view
 from stillmap.results.viewer.scene import read_scene
@@ -100,3 +101,9 @@ def test_default_view_shows_the_whole_scene(result_of):
     slanted = default_view(space)
     away = slanted.position - slanted.look_at
     assert 0.3 < away[2] / np.linalg.norm(away) < 0.9
+
+
+def test_sample_contains_every_lidar_ring():
+    """At even steps 16 rings that come in turn would show one of them."""
+    rings = np.bincount(sample_indices(160_000, 10_000) % 16, minlength=16)
+    assert rings.min() > 400

@@ -1,7 +1,5 @@
 """Poses and boxes of moving objects at a time."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from stillmap.results.object_poses import (
     object_poses_at,
 )
 from stillmap.results.reader import Track
-from stillmap.results.viewer.objects import box_edges, describe_object
+from stillmap.results.viewer.objects import box_edges
 
 NOW = 1_700_000_000_000_000_000
 
@@ -64,18 +62,3 @@ def test_box_edges():
     # it goes along y: its length lies along y
     assert corners.min(axis=0) == pytest.approx([2.5, 3.0, 0.7 - 0.75])
     assert corners.max(axis=0) == pytest.approx([3.5, 5.0, 0.7 + 0.75])
-
-
-def test_facts_of_an_object():
-    one = track([1, 3], [[0, 0], [2, 0]], [[1, 0], [3, 0]])
-    facts = dict(describe_object(one, NOW + 2_000_000_000, NOW))
-    assert facts["Seen"] == "1.0 s to 3.0 s (2.0 s)"
-    assert (facts["Speed now"], facts["Mean, highest"]) == ("2.0 m/s", "2.0, 3.0 m/s")
-    assert (facts["Size"], facts["Scans"]) == ("2.00 x 1.00 x 1.50 m", "2")
-    assert "Beams" not in facts
-    assert dict(describe_object(one, NOW, NOW))["Speed now"] == "not seen"
-    known = replace(one, beams=12345, p_dynamic=0.5)
-    assert describe_object(known, NOW, NOW)[-2:] == [
-        ("Beams", "12,345"),
-        ("Mean P(dynamic)", "0.500"),
-    ]

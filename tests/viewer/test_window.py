@@ -11,7 +11,6 @@ from stillmap.results.viewer.scene import read_scene
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
 from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS
-from stillmap.results.viewer.nodes import escape_markdown
 
 
 def node(window, path):
@@ -106,10 +105,6 @@ def test_playback_starts_again_at_the_end(window):
     window.step()
     window.step()
     assert window.scan == 0
-
-
-def test_markdown_is_escaped():
-    assert escape_markdown("a_b <img src=x>") == r"a\_b \<img src=x\>"
 
 
 def test_actions_of_keys_step_and_pause(window):

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, get_args
 
 from stillmap.cli.arguments import flag_changes, require_apart
 from stillmap.cli.console import show_share
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import workplace
 
 if TYPE_CHECKING:
     from stillmap.results import point_cloud
     from stillmap.results.export import nav2, point_cloud_files
-    from stillmap.results.folder import Exported, ResultFolder
+    from stillmap.results.folder import ResultFolder
+    from stillmap.results.mapped_place import MappedPlace
 
 # a copy for the help: the module that defines them takes long to load
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply", ".xyz")
@@ -95,7 +96,7 @@ def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple
     from stillmap.results.reader import read_run
 
     require_apart(output, place)
-    result = ResultFolder(place, read_run(place), Path(), False)
+    result = ResultFolder(place, read_run(place))
     if args.to == NAV2 or given_zone_flags(args):
         return _convert_to_nav2(args, result, output)
     form = point_cloud_files.format_for(output, args.to)
@@ -113,14 +114,13 @@ def _convert_to_nav2(
 ) -> tuple[list[str], str]:
     from stillmap.core.files import require_new
     from stillmap.results.export import nav2, zones
-    from stillmap.results.export.nav2_parameters import PARAMETERS
     from stillmap.results.reader import read_crossings, read_grid
 
     if args.to != NAV2 and (args.to or output.suffix):
         flag = next(iter(given_zone_flags(args)))
         hint = f"FILE is a folder; if it shall be called so, give --to {NAV2}"
         raise InputError(f"{flag} is for maps and masks of nav2", where=str(output), hint=hint)
-    require_new(output, PARAMETERS, args.overwrite)
+    require_new(output, nav2.PARAMETERS, args.overwrite)
     rule = _traffic_rule(args)
     drawn = zones.read_zones(Path(args.mask)) if args.mask is not None else []
     is_traffic = rule.keepout is not None or rule.slow is not None
@@ -149,10 +149,10 @@ def _traffic_rule(args: argparse.Namespace) -> "nav2.TrafficRule":
 
 def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: Path) -> str:
     from stillmap.core.files import require_new_file
-    from stillmap.results.export import parquet
+    from stillmap.results.tables import write_parquet
 
     require_new_file(output, args.overwrite)
-    parquet.require_pyarrow()
+    import_extra("pyarrow.parquet", output, "written")
     exported = _read_result(args, result, output)
     if exported.recording.dimension != 2:
         raise InputError(
@@ -160,12 +160,12 @@ def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: 
             where=str(result.folder),
             hint=f"its points as a cloud ({', '.join(CLOUDS)}), all of it as a bag (.mcap, .bag)",
         )
-    parquet.write(exported, exported.deskew(), output)
+    write_parquet(exported, output)
     return f"{exported.recording.n_beams} beams"
 
 
-def _describe(exported: "Exported") -> str:
-    scans, objects = exported.recording.n_scans, len(exported.tracks)
+def _describe(exported: "MappedPlace") -> str:
+    scans, objects = exported.recording.n_scans, len(exported.objects)
     return f"{scans} scans, map, trajectory and {objects} objects"
 
 
@@ -193,9 +193,14 @@ def _convert_to_bag(
     return losses, _describe(exported)
 
 
-def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "Exported":
+def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "MappedPlace":
+    from stillmap.results.mapped_place import MappedPlace
+
     with show_share(args.quiet, "reading") as progress:
-        return result.export(progress, workplace(output))
+        recording, _ = result.read(progress, workplace(output))
+    exported = MappedPlace.open(result.folder)
+    exported.recording = result.calibrate(recording)
+    return exported
 
 
 def _convert_to_cloud(

@@ -21,12 +21,12 @@ from stillmap.results.eval.map import (
 from stillmap.results.eval.readers import Truth, read_truth, require_same_beams
 from stillmap.results.eval.relations import RelationErrors, compute_relation_errors
 from stillmap.results.eval.trajectory import read_paired_poses
+from stillmap.results.folder import read_region
 from stillmap.results.reader import (
     is_place,
     moved,
     read_grid,
     read_labels,
-    read_region,
     require_there,
 )
 

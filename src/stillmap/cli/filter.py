@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             result = open_result(folder, args.input)
             target = _find_target(result, output, args.to)
-            filter_writers.require_free(target, output, result.source, args.overwrite)
+            filter_writers.require_free(target, output, result.sources[0], args.overwrite)
             summary = _write_filtered(result, target, output, "", args)
     if args.json:
         print_json({"output": str(output), **summary})
@@ -133,10 +133,11 @@ def _plan_session(
     except InputError as error:
         hint = f"stillmap filter {place}/sessions/{name} -o FILE --input FILE finds it elsewhere"
         raise InputError(error.what, where=error.where, hint=hint) from error
-    file = name + filter_writers.find_ending(None if result.parts else result.source, to)
-    for source in result.sources:
-        require_apart(output, source, place)
-        filter_writers.require_outside(output, source)
+    source = result.sources[0] if len(result.sources) == 1 else None
+    file = name + filter_writers.find_ending(source, to)
+    for path in result.sources:
+        require_apart(output, path, place)
+        filter_writers.require_outside(output, path)
     return result, file, _find_target(result, output / file, to)
 
 
@@ -152,7 +153,7 @@ def _find_target(result: "ResultFolder", output: Path, to: str | None) -> "Filte
     source = result.require_source()
     for path in result.sources:
         require_apart(output, path, result.folder)
-    target = filter_writers.find_target(None if result.parts else source, output, to)
+    target = filter_writers.find_target(source if len(result.sources) == 1 else None, output, to)
     if target.writer is not None:
         writers.require_fit(output, target.writer, result.dimension, result.n_sensors)
     return target
@@ -181,7 +182,7 @@ def _write_filtered(
     blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
     with show_share(args.quiet, "writing") as progress:
         job = FilterJob(
-            result.source,
+            result.sources[0],
             output,
             recording,
             blank,
@@ -201,8 +202,8 @@ def _write_filtered(
         for note in notes:
             say(f"warning: {prefix}{note}")
     return {
-        "input": str(result.source),
-        **({"parts": list(map(str, result.parts))} if result.parts else {}),
+        "input": str(result.sources[0]),
+        **({"parts": list(map(str, result.sources))} if len(result.sources) > 1 else {}),
         "hits": hits,
         "blanked": blanked,
         "scans_left_out": left_out,
@@ -211,9 +212,11 @@ def _write_filtered(
 
 def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget") -> "Recording":
     """The recording at the poses of the map; in one cloud, without the motion during its scans."""
+    from stillmap.io.trajectory import poses_from_tum
     from stillmap.slam import deskew_recording
 
-    poses, recording = result.read_poses(recording), result.calibrate(recording)
+    poses = poses_from_tum(result.folder / "trajectory.tum", recording)
+    recording = result.calibrate(recording)
     if not target.marker:
         recording = deskew_recording(recording, poses, result.slam_options)
     return dataclasses.replace(recording, T_recorded_base=poses)

@@ -154,7 +154,7 @@ def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beam
     from stillmap.results.viewer.scene import read_scene
 
     result = open_result(folder, args.input)
-    scene = read_scene(folder, result.source.name)
+    scene = read_scene(folder, result.sources[0].name)
     if args.no_beams:
         return scene, None
     try:

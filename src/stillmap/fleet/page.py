@@ -2,15 +2,13 @@
 
 from typing import Any
 
-from stillmap.core.files import package_version
 from stillmap.fleet.jobs import Fleet
-from stillmap.results.report.page import environment
+from stillmap.results.report import template
 
 
 def render_page(fleet: Fleet) -> str:
     """The page: no outside request, no script; links lead to the reports beside it."""
-    template = environment().get_template("fleet.html.j2")
-    return template.render(fleet=fleet, totals=_totals(fleet), version=package_version())
+    return template.render_page({"fleet": fleet, "totals": _totals(fleet)}, "fleet.html.j2")
 
 
 def _totals(fleet: Fleet) -> dict[str, Any]:

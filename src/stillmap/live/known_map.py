@@ -27,6 +27,7 @@ from stillmap.live.local_map import (
 from stillmap.pipeline.options import MapMode
 from stillmap.places.evidence import cell_keys
 from stillmap.places.surface_map import SurfaceMap, find_sides
+from stillmap.results.folder import ResultFolder
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.point_cloud import Block, cloud_from_folder
 from stillmap.results.points import append_vertices
@@ -35,7 +36,6 @@ from stillmap.results.reader import (
     OCCUPIED_THRESH,
     RECORD,
     Grid,
-    RunRecord,
     read_grid,
     read_hit_sums,
     read_run,
@@ -339,7 +339,7 @@ def _free_runs(grid: Grid) -> tuple[Float, Float]:
 def _find_frame(source: str | os.PathLike[str] | GridMap, grid: GridMap) -> LocalFrame:
     """The frame in which a result was computed, with whose cells those of its map agree."""
     if not isinstance(source, GridMap) and (Path(source) / RECORD).is_file():
-        noted = RunRecord(Path(source), read_run(Path(source))).frame
+        noted = ResultFolder(Path(source), read_run(Path(source))).frame
         if noted.is_shifted:
             return noted
     return LocalFrame.near(se2.matrix(*grid.origin)[None])

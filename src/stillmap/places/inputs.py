@@ -34,18 +34,18 @@ from stillmap.places.store import (
     read_session,
     write_session,
 )
-from stillmap.results.folder import open_result
+from stillmap.results.folder import ResultFolder, open_result
+from stillmap.results.mapped_place import input_stem
 from stillmap.results.pose_graph_g2o import read_g2o
 from stillmap.results.reader import (
     LOCAL_ORIGIN,
     RECORD,
     TILTING,
-    RunRecord,
     is_place,
     is_result,
     read_run,
 )
-from stillmap.results.result import Result, build, input_stem, load
+from stillmap.results.result import Result, build, load
 from stillmap.slam import PoseGraph, deskew_recording, local_map
 from stillmap.slam.local_map import KEYFRAME_ANGLE
 from stillmap.slam.pose_graph import Constraint
@@ -224,7 +224,7 @@ def _keep_session(
     if recording is None:
         deskewed = result.deskewed
     else:
-        slam_options = RunRecord(mapped, result.run).slam_options
+        slam_options = ResultFolder(mapped, result.run).slam_options
         deskewed = deskew_recording(recording, result.poses, slam_options)
     session = to_session(source.name, result, deskewed, resolve_threads(options.threads))
     cell, p_static = cell_size(options, session.dimension), np.asarray(result.p_static)
@@ -254,7 +254,7 @@ def to_session(name: str, result: Result, deskewed: Recording, threads: int) -> 
         InputError: its record or pose graph is damaged.
     """
     assert result.path is not None
-    record, output = RunRecord(result.path, result.run), result.options.output
+    record, output = ResultFolder(result.path, result.run), result.options.output
     frame = record.frame if record.frame.is_shifted else LocalFrame.near(result.poses)
     poses, graph = frame.to_local(result.poses), None
     if not (np.abs(poses) < MAX_DISTANCE).all():

@@ -24,8 +24,9 @@ from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.evidence import BLOCK, BeamCells, Evidence
 from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.place import Place, PlacedSession, Tie
+from stillmap.results.folder import ResultFolder
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
-from stillmap.results.reader import RECORD, SESSIONS, RunRecord, read_labels, read_run, read_tracks
+from stillmap.results.reader import RECORD, SESSIONS, read_labels, read_run, read_tracks
 from stillmap.results.timeline import HINT, PlaceSession, read_sessions
 
 Float = NDArray[np.float64]
@@ -220,7 +221,7 @@ def read_session(home: Path, path: str | None, stamp_ns: NDArray[np.int64]) -> S
         or not (np.abs(clearance) < MAX_DISTANCE).all()
     ):
         raise _inconsistent(state)
-    frame = RunRecord(home, read_run(home)).read_frame(SESSION_ORIGIN)
+    frame = ResultFolder(home, read_run(home)).read_frame(SESSION_ORIGIN)
     return Session(home.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, frame)
 
 

@@ -22,6 +22,14 @@ STATIC_COLORS = ((70, 74, 80), (168, 172, 178))
 
 HEIGHT_COLORS = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214, 196, 96))
 
+# of kinds of changes between sessions, told apart by color-blind readers too
+KIND_COLORS = {
+    "appeared": (20, 120, 60),
+    "gone": (190, 40, 120),
+    "moved": (40, 90, 200),
+    "door": (150, 92, 0),
+}
+
 _HUE_STEP = 0.618034  # of the circle, from one id to the next, so that neighbors differ
 
 

@@ -1,15 +1,15 @@
-"""A result folder opened again: its recording, its labels and its poses."""
+"""A result folder opened again: its record, and the recording that was mapped."""
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stillmap.core import arrays
+from stillmap.core import arrays, config
+from stillmap.core.array_folder import parse
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import Region
 from stillmap.core.local_frame import LocalFrame
@@ -17,74 +17,144 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
 from stillmap.io.reader import read_parts
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.text_lines import Progress
-from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
+from stillmap.pipeline.options import MapMode, Options, OutputOptions
+from stillmap.pipeline.quality import Quality
+from stillmap.prepare.options import ReadOptions
 from stillmap.results.reader import (
+    EXTENDS,
+    LOCAL_ORIGIN,
     RECORD,
-    Grid,
     Labels,
-    RunRecord,
-    Track,
-    read_colors,
-    read_grid,
+    is_result,
     read_labels,
     read_run,
-    read_tracks,
 )
 from stillmap.results.run_json import read_calibration
-from stillmap.slam import SlamOptions, deskew_recording
+from stillmap.slam import SlamOptions
 
-
-@dataclass(frozen=True, eq=False)
-class Exported(ShortRepr):
-    """A result for export: recording, poses, labels, map and tracks.
-
-    Attributes:
-        recording: T scans with M beams.
-        poses: (T, D+1, D+1) T_map_base.
-        p_static: (M,) float32, NaN for unusable beams.
-        map: occupancy of the static cells; in 3D of those in a robot's way.
-        tracks: of the moving objects.
-        slam: the options of deskewing.
-        colors: (M, 3) uint8 of the end points; None: without.
-        region: the part of the map frame that is shown; None: everything.
-        frame: in which it was computed.
-    """
-
-    recording: Recording
-    poses: NDArray[np.float64]
-    p_static: NDArray[np.float32]
-    map: Grid
-    tracks: list[Track]
-    slam: SlamOptions
-    colors: NDArray[np.uint8] | None = None
-    region: Region | None = None
-    frame: LocalFrame = field(default_factory=LocalFrame)
-
-    def deskew(self) -> Recording:
-        """The recording without the motion during its scans."""
-        return deskew_recording(self.recording, self.poses, self.slam)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class ResultFolder(RunRecord):
+class ResultFolder(ShortRepr):
     """A result folder.
 
     Attributes:
-        source: where its recording is; of one in parts, where the first is.
+        folder: of the result.
+        record: the content of its run.json.
+        sources: where its recording is, or the parts of it in order of time; empty: it has several.
         source_given: whether the user named the recording.
-        parts: where the parts of its recording are, in order of time; empty: it is whole.
     """
 
-    source: Path
-    source_given: bool
-    parts: tuple[Path, ...] = ()
+    folder: Path
+    record: dict[str, Any]
+    sources: tuple[Path, ...] = ()
+    source_given: bool = False
 
     @property
-    def sources(self) -> tuple[Path, ...]:
-        """Path of its recording, or of all parts of it."""
-        return self.parts or (self.source,)
+    def path(self) -> Path:
+        """Of the record."""
+        return self.folder / RECORD
+
+    @property
+    def options(self) -> Options:
+        """Every option as it was resolved for the map.
+
+        Raises:
+            InputError: the record has options that this version does not know.
+        """
+        return self._override(Options(), self.record.get("options") or {})
+
+    @property
+    def read_options(self) -> ReadOptions:
+        """The options with which its recording was read: the same beams have the same numbers.
+
+        Raises:
+            InputError: the record does not say so.
+        """
+        read_as = self._section("read")
+        if "read" not in (self.record.get("options") or {}):
+            raise InputError("names no options", where=str(self.path))
+        return self._override(ReadOptions(), read_as)
+
+    @property
+    def slam_options(self) -> SlamOptions:
+        """The options that deskew its recording as it was deskewed for the map."""
+        return SlamOptions(deskew=self._section("slam").get("deskew") is not False)
+
+    @property
+    def quality(self) -> Quality:
+        """Quality of the result; unknown where the record does not say so."""
+        return Quality(**(self.record.get("quality") or {}))
+
+    @property
+    def region(self) -> Region | None:
+        """The part of the map frame that it shows; None: everything."""
+        region = self._section("output").get("region")
+        return self._override(OutputOptions(), {"region": region}).region
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The frame in which it was computed.
+
+        Raises:
+            InputError: the record has an origin that cannot be.
+        """
+        return self.read_frame(LOCAL_ORIGIN)
+
+    def read_frame(self, name: str) -> LocalFrame:
+        """The frame whose origin (3,) is the entry of a name; without one the map frame.
+
+        Raises:
+            InputError: it is no place.
+        """
+        if self.record.get(name) is None:
+            return LocalFrame()
+        origin = parse(self.record[name], tuple[float, float, float], self.path)
+        if not (np.abs(origin) < MAX_TRANSLATION).all():
+            raise InputError(f"{name} is no place", where=str(self.path))
+        return LocalFrame(np.array(origin))
+
+    @property
+    def map_mode(self) -> MapMode:
+        """Mode of its map image; the default where the record does not say."""
+        mode = self._section("output").get("map_mode")
+        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
+
+    @property
+    def dimension(self) -> int:
+        """Dimension of its recording, 2 or 3."""
+        noted = self.record.get("dimension")  # of a session of a place
+        if noted in (2, 3):
+            return int(noted)
+        return 3 if (self.folder / "static.ply").is_file() else 2
+
+    @property
+    def extends_map(self) -> bool:
+        """True if its clouds hold what its recording does not show: it extends a known map."""
+        return self.record["input"].get(EXTENDS) is True
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensors of its recording that the record lists, at least 1."""
+        sensors = self.record["input"].get("sensors")
+        return max(len(sensors), 1) if isinstance(sensors, list) else 1
+
+    def _section(self, name: str) -> dict[str, Any]:
+        """A section of the options in the record; empty where there is none."""
+        section = (self.record.get("options") or {}).get(name)
+        return section if isinstance(section, dict) else {}
+
+    def _override(self, options: T, changes: dict[str, Any]) -> T:
+        """The options with those of the record that are set."""
+        try:
+            return config.override(options, _drop_unset(changes))
+        except InputError as error:
+            where = str(self.folder)
+            raise InputError(f"has options that cannot be: {error}", where=where) from error
 
     def require_source(self) -> Path:
         """Path of the recording.
@@ -96,7 +166,7 @@ class ResultFolder(RunRecord):
             if not self.source_given and not path.exists():
                 hint = "that is where it was when it was mapped: name it with recording=PATH"
                 raise InputError("does not exist", where=str(path), hint=hint)
-        return self.source
+        return self.sources[0]
 
     def read(
         self,
@@ -117,9 +187,9 @@ class ResultFolder(RunRecord):
         """
         read_as, labels = self.read_options, read_labels(self.folder)
         source = self.require_source()
-        if self.parts:
+        if len(self.sources) > 1:
             recording = read_parts(
-                self.parts, read_as, progress=progress, scratch=scratch, in_order=True
+                self.sources, read_as, progress=progress, scratch=scratch, in_order=True
             )
         else:
             recording = read(source, read_as, progress=progress, scratch=scratch)
@@ -135,38 +205,11 @@ class ResultFolder(RunRecord):
         try:
             found = read_calibration(self.record.get("calibration"))
         except (TypeError, ValueError, KeyError, AttributeError) as error:
-            where = str(self.folder / RECORD)
-            raise InputError(f"has a damaged calibration: {error!r}", where=where) from error
+            what = f"has a damaged calibration: {error!r}"
+            raise InputError(what, where=str(self.path)) from error
         if recording.dimension != 2 or len(found.lasers) != len(recording.T_base_sensor):
             return recording
         return apply_calibration(recording, found)
-
-    def read_poses(self, recording: Recording) -> NDArray[np.float64]:
-        """The estimated poses (T, D+1, D+1) T_map_base of a recording that was read by `read`.
-
-        Raises:
-            InputError: the trajectory is missing or damaged.
-        """
-        return poses_from_tum(self.folder / "trajectory.tum", recording)
-
-    def export(self, progress: Progress | None = None, scratch: Path | None = None) -> Exported:
-        """The content of a result; arguments are those of `read`.
-
-        Raises:
-            InputError: a file is missing or damaged.
-        """
-        recording, labels = self.read(progress, scratch)
-        return Exported(
-            self.calibrate(recording),
-            self.read_poses(recording),
-            labels.p_static,
-            read_grid(self.folder),
-            read_tracks(self.folder / "objects" / "objects.json"),
-            self.slam_options,
-            read_colors(self.folder, recording.n_beams) if recording.dimension == 3 else None,
-            self.region,
-            self.frame,
-        )
 
 
 def match_labels(recording: Recording, labels: Labels, where: str) -> Recording:
@@ -218,23 +261,28 @@ def open_result(
     if recording:
         paths = [recording] if isinstance(recording, str) else [os.fspath(one) for one in recording]
     else:
-        paths = _find_paths(record["input"], str(result / RECORD))
-    parts = tuple(map(Path, paths)) if len(paths) > 1 else ()
-    return ResultFolder(result, record, Path(paths[0]), bool(recording), parts)
+        parts = record["input"].get("parts")
+        noted = parts if isinstance(parts, list) and parts else [record["input"]]
+        paths = [str(one.get("path") or "") if isinstance(one, dict) else "" for one in noted]
+        if not all(paths):
+            hint = "name it with recording=PATH"
+            raise InputError("names no recording", where=str(result / RECORD), hint=hint)
+    return ResultFolder(result, record, tuple(map(Path, paths)), bool(recording))
 
 
-def _find_paths(noted: dict[str, Any], where: str) -> list[str]:
-    """The paths of the recording in a record, or of its parts.
+def read_region(result: Path) -> Region | None:
+    """The part of the map frame that a result shows; None: everything, or the record is missing.
 
     Raises:
-        InputError: there are none.
+        InputError: the record is damaged.
     """
-    parts = noted.get("parts")
-    if isinstance(parts, list) and parts:
-        paths = [one.get("path") if isinstance(one, dict) else None for one in parts]
-    else:
-        paths = [noted.get("path")]
-    found = [path for path in paths if isinstance(path, str) and path]
-    if len(found) < len(paths):
-        raise InputError("names no recording", where=where, hint="name it with recording=PATH")
-    return found
+    return ResultFolder(result, read_run(result)).region if is_result(result) else None
+
+
+def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
+    """Nested options without those that are None."""
+    return {
+        key: _drop_unset(value) if isinstance(value, dict) else value
+        for key, value in changes.items()
+        if value is not None
+    }

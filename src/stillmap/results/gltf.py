@@ -6,7 +6,7 @@ trimesh writes the files with 1 x 1 placeholder images, which are replaced by co
 import io
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,16 +27,8 @@ _VERTICES, _INDICES = 34962, 34963  # targets of glTF buffer views
 _FAR = 1000.0  # m, coordinates from which on 32-bit floats are coarse
 
 
-class Page(NamedTuple):
-    """A compressed texture page."""
-
-    suffix: str
-    kind: str
-    data: bytes
-
-
-class Part(NamedTuple):
-    """The faces of one page, or the gray ones (page -1), with their own vertices."""
+class _Part(NamedTuple):
+    """The faces of one texture page, or the gray ones (page -1), with their own vertices."""
 
     page: int
     vertices: Float
@@ -58,76 +50,44 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
         InputError: it cannot be written.
         MissingExtra: trimesh is not installed.
     """
-    trimesh = import_trimesh(path)
-    pages = compress_pages(mesh, quality)
-    shift = np.zeros(3)
+    trimesh = import_extra("trimesh", path, "written", group="mesh")
+    gltf = import_extra("trimesh.exchange.gltf", path, "written", group="mesh")
+    parts = _split_pages(mesh)
+    shift, move = np.zeros(3), np.eye(4)
     if np.abs(mesh.vertices[mesh.faces]).max(initial=0.0) > _FAR:
-        shift = np.rint(np.mean([part.vertices.mean(axis=0) for part in _parts(mesh)], axis=0))
-    scene = make_scene(trimesh, mesh, _material, shift)
+        shift = np.rint(np.mean([part.vertices.mean(axis=0) for part in parts], axis=0))
+    move[:3, 3] = _y_up(shift)
+    scene = trimesh.Scene()
+    for part in parts:
+        vertices, name = _y_up(part.vertices - shift), _name(part.page)
+        visual = _visual(trimesh, part)
+        geometry = trimesh.Trimesh(vertices, part.faces, visual=visual, process=False)
+        scene.add_geometry(geometry, node_name=name, geom_name=name, transform=move)
+    pages = mesh.pages if isinstance(mesh, TexturedMesh) else []
+    data = [_compress(page, quality) for page in pages]
     images: list[dict[str, Any]] = []
 
     def put_pages(buffers: Any, tree: dict[str, Any]) -> None:
         keys = list(buffers)
         images.extend(tree["images"])
-        for image, page in zip(images, pages, strict=True):
-            buffers[keys[image["bufferView"]]] = page.data + bytes(-len(page.data) % 4)
-            image["mimeType"] = page.kind
+        for image, page in zip(images, data, strict=True):
+            buffers[keys[image["bufferView"]]] = page + bytes(-len(page) % 4)
+            image["mimeType"] = "image/jpeg" if quality else "image/png"
 
     def finish(tree: dict[str, Any]) -> None:
-        for image, page in zip(images, pages, strict=True):
-            tree["bufferViews"][image["bufferView"]]["byteLength"] = len(page.data)
+        for image, page in zip(images, data, strict=True):
+            tree["bufferViews"][image["bufferView"]]["byteLength"] = len(page)
         _finish(tree)
 
-    data = trimesh.exchange.gltf.export_glb(
+    content = gltf.export_glb(
         scene, include_normals=False, buffer_postprocessor=put_pages, tree_postprocessor=finish
     )
     with atomic_file(path) as work:
-        work.write_bytes(data)
+        work.write_bytes(content)
 
 
-def import_trimesh(path: Path) -> Any:
-    """trimesh and what writes the file `path`.
-
-    Raises:
-        MissingExtra: it is not installed.
-    """
-    for name in ("trimesh.exchange.gltf", "trimesh.exchange.obj", "trimesh.visual.material"):
-        import_extra(name, path, "written", group="mesh")
-    return import_extra("trimesh", path, "written", group="mesh")
-
-
-def make_scene(
-    trimesh: Any,
-    mesh: TexturedMesh | Mesh,
-    make_material: Callable[[Any, int], Any],
-    shift: Float | None = None,
-) -> Any:
-    """A scene of trimesh with a geometry per part, y up, moved by `shift` (3,) m.
-
-    Args:
-        trimesh: the library.
-        mesh: with one face at least.
-        make_material: called with the library and the page, -1 for gray.
-        shift: subtracted from the vertices, and part of the transforms; None: zero.
-    """
-    shift = np.zeros(3) if shift is None else shift
-    move = np.eye(4)
-    move[:3, 3] = _y_up(shift)
-    scene = trimesh.Scene()
-    for part in _parts(mesh):
-        name = page_name(part.page)
-        visual = trimesh.visual.TextureVisuals(
-            uv=flip_v(part.uv) if part.page >= 0 else None,
-            material=make_material(trimesh, part.page),
-        )
-        vertices = _y_up(part.vertices - shift)
-        geometry = trimesh.Trimesh(vertices, part.faces, visual=visual, process=False)
-        scene.add_geometry(geometry, node_name=name, geom_name=name, transform=move)
-    return scene
-
-
-def _parts(mesh: TexturedMesh | Mesh) -> list[Part]:
-    """Parts by page, the gray one last: in OBJ files trimesh expects uv for all before."""
+def _split_pages(mesh: TexturedMesh | Mesh) -> list[_Part]:
+    """Parts by page, the gray one last."""
     if not len(mesh):
         raise ValueError("a mesh without faces")
     uv_of_all = mesh.uv if isinstance(mesh, TexturedMesh) else np.zeros((len(mesh.vertices), 2))
@@ -135,12 +95,11 @@ def _parts(mesh: TexturedMesh | Mesh) -> list[Part]:
     parts = []
     for page in sorted(np.unique(of_face).tolist(), key=lambda number: (number < 0, number)):
         used, faces = np.unique(mesh.faces[of_face == page], return_inverse=True)
-        parts.append(Part(page, mesh.vertices[used], faces.reshape(-1, 3), uv_of_all[used]))
+        parts.append(_Part(page, mesh.vertices[used], faces.reshape(-1, 3), uv_of_all[used]))
     return parts
 
 
-def page_name(page: int) -> str:
-    """Name of the geometry and material of a page, -1 for gray."""
+def _name(page: int) -> str:
     return f"page{page}" if page >= 0 else "grey"
 
 
@@ -149,41 +108,32 @@ def _y_up(points: Float) -> Float:
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
-def flip_v(uv: Float) -> Float:
-    """uv counted from the bottom, as in trimesh and OBJ."""
-    return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
-
-
-def placeholder(page: int) -> Image.Image:
-    """A placeholder image that is unique to a page."""
-    return Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
-
-
-def _material(trimesh: Any, page: int) -> Any:
-    """Material of a page, or gray; color factors are linear in glTF."""
-    linear = ((GRAY[0] / 255.0 + 0.055) / 1.055) ** 2.4
-    return trimesh.visual.material.PBRMaterial(
-        name=page_name(page),
-        baseColorTexture=placeholder(page) if page >= 0 else None,
-        baseColorFactor=None if page >= 0 else [linear, linear, linear, 1.0],
+def _visual(trimesh: Any, part: _Part) -> Any:
+    """Material and uv of a part: a placeholder image that is unique to the page, or gray."""
+    page, is_textured = part.page, part.page >= 0
+    linear = ((GRAY[0] / 255.0 + 0.055) / 1.055) ** 2.4  # as color factors of glTF are
+    material = trimesh.visual.material.PBRMaterial(
+        name=_name(page),
+        baseColorTexture=Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
+        if is_textured
+        else None,
+        baseColorFactor=None if is_textured else [linear, linear, linear, 1.0],
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )
+    uv = np.column_stack([part.uv[:, 0], 1.0 - part.uv[:, 1]])  # trimesh counts from the bottom
+    return trimesh.visual.TextureVisuals(uv=uv if is_textured else None, material=material)
 
 
-def compress_pages(mesh: TexturedMesh | Mesh, quality: int) -> list[Page]:
-    """The texture pages as JPEG of a quality, or as PNG where it is 0."""
-    pages = []
-    for page in mesh.pages if isinstance(mesh, TexturedMesh) else ():
-        out = io.BytesIO()
-        if quality:
-            # colours at full resolution: charts have sharp edges
-            Image.fromarray(page).save(out, "JPEG", quality=quality, subsampling=0)
-            pages.append(Page(".jpg", "image/jpeg", out.getvalue()))
-        else:
-            Image.fromarray(page).save(out, "PNG")
-            pages.append(Page(".png", "image/png", out.getvalue()))
-    return pages
+def _compress(page: NDArray[np.uint8], quality: int) -> bytes:
+    """A texture page as JPEG of a quality, or as PNG where it is 0."""
+    out = io.BytesIO()
+    if quality:
+        # colours at full resolution: charts have sharp edges
+        Image.fromarray(page).save(out, "JPEG", quality=quality, subsampling=0)
+    else:
+        Image.fromarray(page).save(out, "PNG")
+    return out.getvalue()
 
 
 def _finish(tree: dict[str, Any]) -> None:

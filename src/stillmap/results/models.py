@@ -4,10 +4,9 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
 from stillmap.core.grid_map import is_inside, shift_region
@@ -28,15 +27,14 @@ from stillmap.results.gltf import write_glb
 from stillmap.rig.build import TiltingResult, shift_tilting
 
 if TYPE_CHECKING:
-    from stillmap.results.result import Result
+    from stillmap.results.mapped_place import MappedPlace
 
 _MICROMETRES = 6  # digits
-_SQUARE_CENTIMETRES = 4
 
 
 @limit_blas_threads()
 def build_models(
-    result: "Result | MappingResult",
+    result: "MappedPlace | MappingResult",
     *,
     tilting: TiltingResult | None = None,
     progress: Progress = no_progress,
@@ -154,30 +152,3 @@ def write_faces(
             f"T_camera_{name}": poses,
         },
     )
-
-
-def models_record(models: Models) -> dict[str, Any]:
-    """The entry `models` of `run.json`."""
-    place = models.assignment
-    areas = place.mesh.areas()
-
-    def area(of: NDArray[np.bool_]) -> float:
-        return round(float(areas[of].sum()), _SQUARE_CENTIMETRES)
-
-    points = {} if models.point_colors is None else {"points": dict(models.point_colors.counts)}
-    used = {view.image for k, view in enumerate(models.views) if (place.view == k).any()}
-    return {
-        "faces": len(areas),
-        "area": area(np.ones(len(areas), np.bool_)),
-        "area_seen": area(place.visible),
-        "area_painted": area(place.view >= 0),
-        "pictures": {
-            "used": len(used),
-            "usable": len(models.views),
-            "left_out": dict(models.left_out),
-            "unread": list(models.unread),
-        },
-        "pages": [list(page.shape[:2]) for page in models.textured.pages],
-        "objects": {"found": models.n_objects, "modelled": len(models.objects)},
-        **points,
-    }

@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.results.reader import Track
+from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
+Mover = MovingObject | Track
 
 _MIN_SPEED = 0.2  # m/s from which a velocity gives the heading
 
@@ -36,7 +38,7 @@ def headings(velocity: Float) -> Float:
     return np.asarray(np.interp(np.arange(len(velocity)), moving, angle))
 
 
-def interpolate_pose(track: Track, stamp_ns: int) -> Float:
+def interpolate_pose(track: Mover, stamp_ns: int) -> Float:
     """T_map_object (4, 4) at a time, interpolated; constant beyond the ends of the track."""
     # differences first: stamps in ns exceed the precision of float64
     seconds = 1e-9 * (track.stamp_ns - stamp_ns)
@@ -47,7 +49,7 @@ def interpolate_pose(track: Track, stamp_ns: int) -> Float:
     return T
 
 
-def object_poses_at(tracks: Sequence[Track], stamp_ns: int) -> ObjectPoses:
+def object_poses_at(tracks: Sequence[Mover], stamp_ns: int) -> ObjectPoses:
     """Poses of the objects index tracks span a time."""
     index = [n for n, one in enumerate(tracks) if is_present(one, stamp_ns)]
     T = [interpolate_pose(tracks[n], stamp_ns) for n in index]
@@ -57,13 +59,13 @@ def object_poses_at(tracks: Sequence[Track], stamp_ns: int) -> ObjectPoses:
     )
 
 
-def is_present(track: Track, stamp_ns: int) -> bool:
+def is_present(track: Mover, stamp_ns: int) -> bool:
     """True if the track spans a time."""
     return bool(track.stamp_ns[0] <= stamp_ns <= track.stamp_ns[-1])
 
 
 def iter_present_tracks(
-    tracks: Sequence[Track], stamp_ns: NDArray[np.int64]
+    tracks: Sequence[Mover], stamp_ns: NDArray[np.int64]
 ) -> Iterator[list[int]]:
     """For each of the rising stamps (T,), the indices of the tracks that span it."""
     first = [int(np.searchsorted(stamp_ns, one.stamp_ns[0])) for one in tracks]

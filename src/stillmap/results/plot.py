@@ -2,6 +2,7 @@
 
 import html
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,14 +14,13 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.quality import Quality
+from stillmap.results.colors import KIND_COLORS
+from stillmap.results.mapped_place import MappedPlace
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
-from stillmap.results.report.place import KIND_COLORS
 from stillmap.results.timeline import SessionChange
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from stillmap.results.result import Result
 
 _BLUE, _ORANGE = "#1f6feb", "#f07800"
 _MAX_POINTS = 50_000  # dynamic returns in a figure
@@ -28,18 +28,22 @@ _PREVIEW_PIXELS = 420  # longest edge in a notebook
 
 
 def plot_result(
-    result: "Result", ax: "Axes | None", *, trajectory: bool, dynamic: bool, changes: bool
+    result: MappedPlace,
+    ax: "Axes | None",
+    *,
+    trajectory: bool,
+    moving: Sequence[MappedPlace],
+    changes: bool,
 ) -> "Axes":
-    """See `Result.plot`."""
+    """See `Result.plot`; dynamic returns are those of the sessions `moving`."""
     if ax is None:
         ax = _make_axes()
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")
     ax.imshow(np.asarray(image), extent=_extent(result, image), interpolation="nearest")
     placed = [one for one in result.sessions if one.accepted]
-    if dynamic:
-        for one in placed:
-            _draw_dynamic(result.load_session(one.name), ax)
+    for session in moving:
+        _draw_dynamic(session, ax)
     if trajectory:
         for one in placed:
             x, y = _track(result)[one.scans].T
@@ -73,7 +77,7 @@ def _make_axes() -> "Axes":
     return axes
 
 
-def _draw_dynamic(result: "Result", ax: "Axes") -> None:
+def _draw_dynamic(result: MappedPlace, ax: "Axes") -> None:
     """Draw returns from what moves."""
     points = sample_dynamic_points(
         result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
@@ -97,7 +101,7 @@ def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:
             )
 
 
-def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, float]:
+def _extent(result: MappedPlace, image: Image.Image) -> tuple[float, float, float, float]:
     """Left, right, bottom and top of the picture of a map, in metres.
 
     Pixels are whole squares of cells: the last ones may reach beyond the window.
@@ -108,7 +112,7 @@ def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, 
     return x0, x0 + image.width * edge, y0, y0 + image.height * edge
 
 
-def summarize_as_html(result: "Result") -> str:
+def summarize_as_html(result: MappedPlace) -> str:
     """A small picture of the map and the key facts; needs neither matplotlib nor a network."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
@@ -125,12 +129,12 @@ def summarize_as_html(result: "Result") -> str:
     )
 
 
-def key_facts(result: "Result") -> dict[str, str]:
+def key_facts(result: MappedPlace) -> dict[str, str]:
     """The key figures of a result, by their names."""
     stamps, grid = result.stamp_ns, result.map
     height, width = (n * grid.resolution for n in grid.p_occupied.shape)
     seconds, distance = 0.0, 0.0
-    for scans in result._stretches() if len(stamps) else []:
+    for scans in result.stretches if len(stamps) else []:
         span, steps = stamps[scans], np.diff(_track(result)[scans], axis=0)
         seconds += float(span[-1] - span[0]) * 1e-9
         distance += float(np.linalg.norm(steps, axis=1).sum())
@@ -169,7 +173,7 @@ def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[
     return hits, dynamic
 
 
-def _preview(result: "Result") -> Image.Image:
+def _preview(result: MappedPlace) -> Image.Image:
     """The map with the trajectory, small."""
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")
@@ -177,13 +181,13 @@ def _preview(result: "Result") -> Image.Image:
     width, height = (max(1, round(n * factor)) for n in image.size)
     how = Image.Resampling.BOX if factor < 1.0 else Image.Resampling.NEAREST
     image = image.resize((width, height), how)
-    pixels = MapView(window, (width, height), False).to_pixels(_track(result))
-    for scans in result._stretches():
+    pixels = MapView(window, (width, height)).to_pixels(_track(result))
+    for scans in result.stretches:
         way = [(x, y) for x, y in pixels[scans].tolist()]
         ImageDraw.Draw(image).line(way, fill=_BLUE, width=2)
     return image.quantize(64)
 
 
-def _track(result: "Result") -> NDArray[np.float64]:
+def _track(result: MappedPlace) -> NDArray[np.float64]:
     """(T, 2) positions of the robot in metres."""
     return result.poses[:, :2, -1]

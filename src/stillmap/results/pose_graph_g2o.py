@@ -7,7 +7,6 @@ vector, as GTSAM reads it.
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,6 +24,7 @@ Float = NDArray[np.float64]
 
 _VERTEX = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 _EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
+_SIZES = {2: (3, 3), 3: (7, 6)}  # numbers of a pose, rows of an information matrix
 _FIX = "FIX"
 _MAX_BYTES = 1 << 30
 
@@ -80,52 +80,51 @@ def read_g2o(path: Path) -> PoseGraph:
     Raises:
         InputError: the file is missing or damaged; names the line.
     """
-    ids, rows, edges, D = list[int](), list[list[float]](), list[list[str]](), 0
+    ids, rows, ends, edges, D = [], list[list[float]](), list[list[int]](), list[list[float]](), 0
     for number, line in enumerate(_read_lines(path), start=1):
         tag, *words = line.split() or [""]
         try:
             if tag in _VERTEX.values():
-                D = 2 if tag == _VERTEX[2] else 3
+                D = D or (2 if tag == _VERTEX[2] else 3)
                 ids.append(int(words[0]))
-                rows.append(_floats(words[1:], 3 if D == 2 else 7))
+                rows.append(_floats(words[1:], _SIZES[D][0]))
             elif tag in _EDGE.values():
-                edges.append([tag, *words])
-        except (ValueError, IndexError) as error:
-            raise _damage_error(path, number, error) from error
+                n_pose, dof = _SIZES[D]
+                ends.append([int(word) for word in words[:2]])
+                edges.append(_floats(words[2:], n_pose + dof * (dof + 1) // 2))
+        except (ValueError, IndexError, KeyError) as error:
+            raise InputError(f"is damaged: {error}", where=f"{path}, line {number}") from error
     if not ids or np.any(np.diff(ids) <= 0):
         raise InputError("is damaged: vertices are missing or out of order", where=str(path))
-    return PoseGraph(
-        np.array(ids, np.intp), _to_poses(np.array(rows)), _read_edges(path, edges, ids, D)
-    )
+    try:
+        keyframes, poses = np.array(ids, np.intp), _to_poses(np.array(rows))
+        return PoseGraph(keyframes, poses, _to_constraints(keyframes, ends, edges, D))
+    except (ValueError, OverflowError, np.linalg.LinAlgError) as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _read_edges(path: Path, edges: list[list[str]], ids: list[int], D: int) -> list[Constraint]:
-    """The constraints of the words of edges between vertices.
+def _to_constraints(
+    keyframes: NDArray[np.intp], ends: list[list[int]], edges: list[list[float]], D: int
+) -> list[Constraint]:
+    """The constraints of edges between vertices of these ids.
 
     Raises:
-        InputError: an edge is damaged.
+        ValueError, OverflowError, LinAlgError: an edge is damaged.
     """
     if not edges:
         return []
-    try:
-        ends, rows = zip(*(_parse_edge(edge, ids, D) for edge in edges), strict=True)
-        values = np.array(rows)
-        n_pose, dof = (3, 3) if D == 2 else (7, 6)
-        upper = np.zeros((len(edges), dof, dof))
-        row, column = np.triu_indices(dof)
-        upper[:, row, column] = upper[:, column, row] = values[:, n_pose:]
-        covariance = np.asarray(np.linalg.inv(upper), np.float64)
-        bad = np.flatnonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0.0)
-        if len(bad):
-            between = " to ".join(edges[int(bad[0])][1:3])
-            raise ValueError(f"the information of {between} is not positive definite")
-        poses = _to_poses(values[:, :n_pose])
-    except (ValueError, IndexError, np.linalg.LinAlgError) as error:
-        raise InputError(f"is damaged: an edge: {error}", where=str(path)) from error
-    return [
-        Constraint(first, second, T, covariance[k])
-        for k, ((first, second), T) in enumerate(zip(ends, poses, strict=True))
-    ]
+    of_vertices, values, (n_pose, dof) = np.array(ends, np.intp), np.array(edges), _SIZES[D]
+    index = np.searchsorted(keyframes, of_vertices)
+    if not np.array_equal(keyframes[index.clip(max=len(keyframes) - 1)], of_vertices):
+        raise ValueError("an edge has no vertex")
+    information = np.zeros((len(edges), dof, dof))
+    row, column = np.triu_indices(dof)
+    information[:, row, column] = information[:, column, row] = values[:, n_pose:]
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    if (np.linalg.eigvalsh(covariance)[:, 0] <= 0.0).any():
+        raise ValueError("the information of an edge is not positive definite")
+    parts = zip(index.tolist(), _to_poses(values[:, :n_pose]), covariance, strict=True)
+    return [Constraint(first, second, T, part) for (first, second), T, part in parts]
 
 
 def _read_lines(path: Path) -> list[str]:
@@ -133,10 +132,6 @@ def _read_lines(path: Path) -> list[str]:
         return read_text(path, _MAX_BYTES).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is damaged: no text", where=str(path)) from error
-
-
-def _damage_error(path: Path, number: int, error: Exception) -> InputError:
-    return InputError(f"is damaged: {error}", where=f"{path}, line {number}")
 
 
 def _floats(words: list[str], count: int) -> list[float]:
@@ -148,19 +143,3 @@ def _floats(words: list[str], count: int) -> list[float]:
 
 def _to_poses(rows: Float) -> Float:
     return se2.matrix(*rows.T) if rows.shape[1] == 3 else poses_from_rows(rows)
-
-
-def _parse_edge(edge: list[str], ids: list[int], D: int) -> tuple[tuple[int, int], list[float]]:
-    """The indices of both vertices of an edge, and its numbers."""
-    tag, one, other, *words = edge
-    if tag != _EDGE[D]:
-        raise ValueError(f"{tag} among vertices of {D}D")
-    first, second = (bisect_left(ids, int(word)) for word in (one, other))
-    if (
-        first == len(ids)
-        or second == len(ids)
-        or [ids[first], ids[second]] != [int(one), int(other)]
-    ):
-        raise ValueError(f"no vertex {one} or {other}")
-    n_pose, dof = (3, 3) if D == 2 else (7, 6)
-    return (first, second), _floats(words, n_pose + dof * (dof + 1) // 2)

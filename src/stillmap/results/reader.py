@@ -3,13 +3,13 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from stillmap.core import config, se2
+from stillmap.core import se2
 from stillmap.core.array_folder import (
     parse,
     read_array,
@@ -18,21 +18,14 @@ from stillmap.core.array_folder import (
     read_record,
 )
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.errors import InputError, install_command
-from stillmap.core.grid_map import GridMap, Region
+from stillmap.core.errors import InputError
+from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
-from stillmap.mesh.options import MeshOptions
-from stillmap.pipeline.options import MapMode, Options, OutputOptions
-from stillmap.pipeline.quality import Quality
-from stillmap.prepare.options import ReadOptions
-from stillmap.slam import SlamOptions
 
 Float = NDArray[np.float64]
 Origin = tuple[float, float, float]
-T = TypeVar("T")
 
 RECORD = "run.json"  # every result has it
 SESSIONS = "sessions.json"  # every place of several sessions has it
@@ -90,19 +83,6 @@ def require_there(*paths: Path) -> None:
         if not path.is_dir():
             what = "is no folder" if path.exists() else "does not exist"
             raise InputError(what, where=str(path))
-
-
-def require_model(result: Path) -> Path:
-    """The model of the place in a result.
-
-    Raises:
-        InputError: there is none.
-    """
-    path = result / "mesh.glb"
-    if not path.is_file():
-        hint = f"mesh.enabled=true makes them of 3D recordings, with {install_command('mesh')}"
-        raise InputError("holds no model", where=str(result), hint=hint)
-    return path
 
 
 def is_result(path: Path) -> bool:
@@ -174,7 +154,7 @@ def read_grid(result: Path) -> Grid:
     if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
         what = f"p_occupied is {p_occupied.shape} {p_occupied.dtype}"
         raise InputError(what, where=str(path), hint="scores are for maps in the plane")
-    if not is_probability(p_occupied):
+    if not _is_within(p_occupied, 1.0):
         raise InputError("p_occupied is no probability", where=str(path))
     return Grid(p_occupied.astype(np.float32, copy=False), origin, resolution)
 
@@ -190,19 +170,9 @@ def read_hit_sums(result: Path, shape: tuple[int, ...]) -> NDArray[np.floating[A
     if alpha.shape != shape or alpha.dtype.kind != "f":
         what = f"alpha is {alpha.shape} {alpha.dtype}, p_occupied {shape}"
         raise InputError(what, where=str(path))
-    if not is_hit_sum(alpha):
+    if not _is_within(alpha, _MAX_HITS):
         raise InputError("alpha is no sum of hits", where=str(path))
     return alpha
-
-
-def is_probability(layer: NDArray[np.floating[Any]]) -> bool:
-    """True if all values that are not NaN are from 0 to 1."""
-    return _is_within(layer, 1.0)
-
-
-def is_hit_sum(layer: NDArray[np.floating[Any]]) -> bool:
-    """True if all values that are not NaN can be sums of hits in a cell."""
-    return _is_within(layer, _MAX_HITS)
 
 
 def _is_within(layer: NDArray[np.floating[Any]], limit: float) -> bool:
@@ -371,140 +341,6 @@ class _Run:
     warnings: list[str] | None = None
     quality: _Quality | None = None
     dimension: int | None = None
-
-
-@dataclass(frozen=True)
-class RunRecord(ShortRepr):
-    """The record of a result.
-
-    Attributes:
-        folder: of the result.
-        record: the content of its run.json.
-    """
-
-    folder: Path
-    record: dict[str, Any]
-
-    @property
-    def options(self) -> Options:
-        """Every option as it was resolved for the map.
-
-        Raises:
-            InputError: the record has options that this version does not know.
-        """
-        return self._override(Options(), self.record.get("options") or {})
-
-    @property
-    def read_options(self) -> ReadOptions:
-        """The options with which its recording was read: the same beams have the same numbers.
-
-        Raises:
-            InputError: the record does not say so.
-        """
-        read_as = self._section("read")
-        if "read" not in (self.record.get("options") or {}):
-            raise InputError("names no options", where=str(self.folder / RECORD))
-        return self._override(ReadOptions(), read_as)
-
-    @property
-    def slam_options(self) -> SlamOptions:
-        """The options that deskew its recording as it was deskewed for the map."""
-        return SlamOptions(deskew=self._section("slam").get("deskew") is not False)
-
-    @property
-    def texture_quality(self) -> int:
-        """JPEG quality of the texture pages; the default where the record does not have it."""
-        quality = self._section("mesh").get("texture_quality")
-        return self._override(MeshOptions(), {"texture_quality": quality}).texture_quality
-
-    @property
-    def quality(self) -> Quality:
-        """Quality of the result; unknown where the record does not say so."""
-        return Quality(**(self.record.get("quality") or {}))
-
-    @property
-    def region(self) -> Region | None:
-        """The part of the map frame that it shows; None: everything."""
-        region = self._section("output").get("region")
-        return self._override(OutputOptions(), {"region": region}).region
-
-    @property
-    def frame(self) -> LocalFrame:
-        """The frame in which it was computed.
-
-        Raises:
-            InputError: the record has an origin that cannot be.
-        """
-        return self.read_frame(LOCAL_ORIGIN)
-
-    def read_frame(self, name: str) -> LocalFrame:
-        """The frame whose origin (3,) is the entry of a name; without one the map frame.
-
-        Raises:
-            InputError: it is no place.
-        """
-        if self.record.get(name) is None:
-            return LocalFrame()
-        origin = parse(self.record[name], tuple[float, float, float], self.folder / RECORD)
-        if not (np.abs(origin) < MAX_TRANSLATION).all():
-            raise InputError(f"{name} is no place", where=str(self.folder / RECORD))
-        return LocalFrame(np.array(origin))
-
-    @property
-    def map_mode(self) -> MapMode:
-        """Mode of its map image; the default where the record does not say."""
-        mode = self._section("output").get("map_mode")
-        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
-
-    @property
-    def dimension(self) -> int:
-        """Dimension of its recording, 2 or 3."""
-        noted = self.record.get("dimension")  # of a session of a place
-        if noted in (2, 3):
-            return int(noted)
-        return 3 if (self.folder / "static.ply").is_file() else 2
-
-    @property
-    def extends_map(self) -> bool:
-        """True if its clouds hold what its recording does not show: it extends a known map."""
-        return self.record["input"].get(EXTENDS) is True
-
-    @property
-    def n_sensors(self) -> int:
-        """Number of sensors of its recording that the record lists, at least 1."""
-        sensors = self.record["input"].get("sensors")
-        return max(len(sensors), 1) if isinstance(sensors, list) else 1
-
-    def _section(self, name: str) -> dict[str, Any]:
-        """A section of the options in the record; empty where there is none."""
-        section = (self.record.get("options") or {}).get(name)
-        return section if isinstance(section, dict) else {}
-
-    def _override(self, options: T, changes: dict[str, Any]) -> T:
-        """The options with those of the record that are set."""
-        try:
-            return config.override(options, _drop_unset(changes))
-        except InputError as error:
-            where = str(self.folder)
-            raise InputError(f"has options that cannot be: {error}", where=where) from error
-
-
-def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
-    """Nested options without those that are None."""
-    return {
-        key: _drop_unset(value) if isinstance(value, dict) else value
-        for key, value in changes.items()
-        if value is not None
-    }
-
-
-def read_region(result: Path) -> Region | None:
-    """The part of the map frame that a result shows; None: everything, or the record is missing.
-
-    Raises:
-        InputError: the record is damaged.
-    """
-    return RunRecord(result, read_run(result)).region if is_result(result) else None
 
 
 def read_run(result: Path) -> dict[str, Any]:

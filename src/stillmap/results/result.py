@@ -3,58 +3,29 @@
 # signatures name ArrayLike instead of spelling it out
 from __future__ import annotations
 
-import os
 import shutil
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from stillmap.core import config, se2
+from stillmap.core import config
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
-from stillmap.core.grid_map import GridMap
 from stillmap.core.input_files import copy_file
 from stillmap.core.profiling import Progress, StageTimer, no_progress, show_progress
 from stillmap.core.recording import Recording
-from stillmap.io.trajectory import read_tum
 from stillmap.pipeline import inputs
 from stillmap.pipeline.options import DEFAULTS, Options
-from stillmap.pipeline.quality import Quality
-from stillmap.pipeline.result import MappingResult, map_recording
-from stillmap.prepare.beam_times import add_beam_times
-from stillmap.results.folder import ResultFolder, match_labels, open_result
+from stillmap.pipeline.result import map_recording
+from stillmap.results.mapped_place import MappedPlace, PathLike, Source
 from stillmap.results.plot import plot_result, summarize_as_html
-from stillmap.results.reader import (
-    RECORD,
-    SESSIONS,
-    TILTING,
-    Labels,
-    Track,
-    is_place,
-    read_grid,
-    read_labels,
-    read_run,
-    read_tracks,
-)
-from stillmap.results.run_json import run_record
+from stillmap.results.reader import RECORD
 from stillmap.results.tables import TableName, make_table
-from stillmap.results.timeline import (
-    PlaceSession,
-    SessionChange,
-    read_changes,
-    read_sessions,
-    read_states,
-)
 from stillmap.results.writer import save
-from stillmap.slam import deskew_recording
-from stillmap.tracking import MovingObject
 
 if TYPE_CHECKING:
     import pandas
@@ -63,13 +34,8 @@ if TYPE_CHECKING:
 
     from stillmap.mesh.build import Models
 
-Float = NDArray[np.float64]
-PathLike: TypeAlias = str | os.PathLike[str]
-Source: TypeAlias = Recording | PathLike | Sequence[PathLike]
 
-
-@dataclass(eq=False, repr=False)
-class Result:
+class Result(MappedPlace):
     """A mapped place: T scans with M beams in D dimensions, of one session or several.
 
     Of several, poses, stamps and labels are those of the sessions one after the other. One that was
@@ -90,102 +56,6 @@ class Result:
         source: the recording, its path or those of its parts, where it was given; None: as the
             record says.
     """
-
-    map: GridMap
-    poses: Float
-    stamp_ns: NDArray[np.int64]
-    p_static: NDArray[np.float32]
-    hit: NDArray[np.bool_]
-    objects: Sequence[MovingObject | Track]
-    sessions: list[PlaceSession]
-    changes: list[SessionChange]
-    mapping: MappingResult | None = None
-    folder: ResultFolder | None = None
-    source: Recording | str | Sequence[PathLike] | None = None
-
-    @classmethod
-    def of(cls, mapping: MappingResult) -> Result:
-        """A recording that was just mapped."""
-        recording = mapping.recording
-        return cls(
-            map=mapping.map,
-            poses=mapping.poses,
-            stamp_ns=recording.stamp_ns,
-            p_static=mapping.p_static,
-            hit=recording.hit,
-            objects=mapping.objects,
-            sessions=[_only_session(recording.source.path, recording.stamp_ns, mapping.poses)],
-            changes=[],
-            mapping=mapping,
-        )
-
-    def __getattr__(self, name: str) -> Any:
-        mapping = None if name.startswith("__") else self.__dict__.get("mapping")
-        if mapping is None:
-            raise AttributeError(f"a {type(self).__name__} has no {name}")
-        return getattr(mapping, name)
-
-    @property
-    def path(self) -> Path | None:
-        """The folder that it was loaded from; None: it was built."""
-        return None if self.folder is None else self.folder.folder
-
-    @property
-    def run(self) -> dict[str, Any]:
-        """The content of `run.json`."""
-        return self._loaded.record if self.mapping is None else run_record(self.mapping)
-
-    @property
-    def quality(self) -> Quality:
-        """Of labels and geometry, from 0 to 100; None where it cannot be told."""
-        return self._loaded.quality if self.mapping is None else self.mapping.quality
-
-    @property
-    def warnings(self) -> list[str]:
-        """One sentence each."""
-        if self.mapping is not None:
-            return self.mapping.warnings
-        return list(self.run.get("warnings") or [])
-
-    @property
-    def options(self) -> Options:
-        """Every option as resolved.
-
-        Raises:
-            InputError: this version does not know them.
-        """
-        return self._loaded.options if self.mapping is None else self.mapping.options
-
-    @cached_property
-    def recording(self) -> Recording:
-        """The recording as it was mapped; of one that was loaded, read when it is first used.
-
-        Raises:
-            InputError: it is not there, is not the one that was mapped, or there are several.
-        """
-        if self.mapping is not None:
-            return self.mapping.recording
-        folder = self._loaded
-        if len(self._stretches()) > 1:
-            hint = "load_session(NAME).recording is that of one session"
-            raise InputError("is a place of several recordings", where=str(self.path), hint=hint)
-        if isinstance(self.source, Recording):
-            mapped = match_labels(self.source, read_labels(folder.folder), "recording")
-            # read from a file, it would have them already
-            recording = add_beam_times(mapped, folder.read_options.spin)
-        else:
-            recording, _ = open_result(folder.folder, self.source).read()
-        if recording.dimension != self.poses.shape[-1] - 1:
-            what = f"is in {recording.dimension}D, another dimension than the result"
-            raise InputError(what, where="recording")
-        return folder.calibrate(recording)
-
-    @property
-    def deskewed(self) -> Recording:
-        """The recording without the motion during its scans, computed at every call."""
-        if self.mapping is not None:
-            return self.mapping.deskewed
-        return deskew_recording(self.recording, self.poses, self._loaded.slam_options)
 
     def load_session(self, name: str, *, recording: Source | None = None) -> Result:
         """One session as a result, in the frame of the place and with its map.
@@ -222,7 +92,7 @@ class Result:
         if self.mapping is not None:
             save(self.mapping, target, overwrite, models=models)
             return
-        source = self._loaded.folder
+        source = self.loaded.folder
         if source.resolve() in (target.resolve(), *target.resolve().parents):
             raise InputError("is the result itself, or inside", where=str(target))
         with atomic_folder(target, RECORD, overwrite) as folder:
@@ -250,7 +120,9 @@ class Result:
         Raises:
             MissingExtra: matplotlib is not installed.
         """
-        return plot_result(self, ax, trajectory=trajectory, dynamic=dynamic, changes=changes)
+        names = [one.name for one in self.sessions if one.accepted] if dynamic else []
+        moving = [self.load_session(name) for name in names]
+        return plot_result(self, ax, trajectory=trajectory, moving=moving, changes=changes)
 
     def to_arrow(self, table: TableName = "beams") -> pyarrow.Table:
         """One of the result's tables.
@@ -278,7 +150,7 @@ class Result:
 
     def __repr__(self) -> str:
         n, notes, m = len(self.objects), len(self.warnings), len(self.changes)
-        placed, given = len(self._stretches()), len(self.sessions)
+        placed, given = len(self.stretches), len(self.sessions)
         of = f"{placed} of {given} sessions with " if given > 1 else ""
         between = f"{m} change{'s' * (m != 1)} between them, " if given > 1 else ""
         return (
@@ -289,38 +161,6 @@ class Result:
 
     def _repr_html_(self) -> str:
         return summarize_as_html(self)
-
-    @property
-    def _loaded(self) -> ResultFolder:
-        assert self.folder is not None
-        return self.folder
-
-    def _stretches(self) -> list[slice]:
-        """The scans of each session that is in the place, in their order."""
-        placed = [one.scans for one in self.sessions if one.accepted]
-        return sorted(placed, key=lambda scans: int(scans.start))
-
-
-def _only_session(path: str | None, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
-    """The session of a result of one recording, whose frame is the map frame."""
-    D = poses.shape[-1] - 1
-    times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
-    return PlaceSession(
-        input_stem(Path(path)) if path else "session",
-        path,
-        True,
-        T_place_session=np.eye(D + 1),
-        covariance=np.zeros((3 * (D - 1), 3 * (D - 1))),
-        scans=slice(0, len(stamp_ns)),
-        first_ns=times[0],
-        last_ns=times[1],
-    )
-
-
-def input_stem(path: Path) -> str:
-    """The name of an input without endings."""
-    name = Path(os.path.abspath(path)).name
-    return name.split(".")[0] or name
 
 
 def build(
@@ -400,49 +240,7 @@ def load(path: PathLike, *, recording: Source | None = None) -> Result:
         >>> result = stillmap.load("out")
         >>> result.plot()
     """
-    folder, has_several = Path(path), is_place(Path(path))
-    if has_several and recording is not None:
-        hint = "load_session(NAME, recording=PATH) says where that of one session is"
-        raise InputError("is a place of several recordings", where=str(path), hint=hint)
-    record, labels = read_run(folder), read_labels(folder)
-    opened = ResultFolder(folder, record, Path(), recording is not None)
-    poses, changes = _read_poses(opened, labels), list[SessionChange]()
-    noted = record["input"].get("path")
-    read_from = noted if isinstance(noted, str) and noted else None
-    sessions = [_only_session(read_from, labels.stamp_ns, poses)]
-    if has_several:
-        sessions = read_sessions(folder)
-        changes = read_changes(folder, read_states(folder)[1])
-    result = Result(
-        map=read_grid(folder),
-        poses=poses,
-        stamp_ns=labels.stamp_ns,
-        p_static=labels.p_static,
-        hit=labels.hit,
-        objects=read_tracks(folder / "objects" / "objects.json"),
-        sessions=sessions,
-        changes=changes,
-        folder=opened,
-        source=os.fspath(recording) if isinstance(recording, os.PathLike) else recording,
-    )
-    stretches = result._stretches()
-    ends = [0, *(scans.stop for scans in stretches)]
-    if [scans.start for scans in stretches] != ends[:-1] or ends[-1] != len(poses):
-        what = "is damaged: its scans are not those of the place"
-        raise InputError(what, where=str(folder / SESSIONS))
-    return result
-
-
-def _read_poses(opened: ResultFolder, labels: Labels) -> Float:
-    """(T, D+1, D+1) T_map_base."""
-    path = opened.folder / "trajectory.tum"
-    stamp_ns, poses = read_tum(path)
-    if not np.array_equal(stamp_ns, labels.stamp_ns):
-        what = f"has {len(stamp_ns)} poses, not one for each of {len(labels.stamp_ns)} scans"
-        raise InputError(what, where=str(path))
-    # a rig with a tilting laser writes clouds, but its map is that of the planar one
-    is_3d = opened.dimension == 3 and not (opened.folder / TILTING).is_dir()
-    return poses if is_3d else se2.project_to_plane(poses)
+    return Result.open(path, recording)
 
 
 def remove_with(result: Result, folder: Path) -> None:

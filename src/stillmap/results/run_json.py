@@ -22,6 +22,7 @@ from stillmap.slam import BareStretch, LoopClosure
 from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
+    from stillmap.mesh.build import Models
     from stillmap.rig.build import TiltingResult
 
 
@@ -109,6 +110,33 @@ def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
         "boxes": tilting.boxes_hit,
         "objects": len(tilting.objects),
         "learned": tilting.learned,
+    }
+
+
+def models_record(models: "Models") -> dict[str, Any]:
+    """The entry `models` of `run.json`."""
+    place = models.assignment
+    areas = place.mesh.areas()
+
+    def area(of: NDArray[np.bool_]) -> float:
+        return round(float(areas[of].sum()), 4)
+
+    points = {} if models.point_colors is None else {"points": dict(models.point_colors.counts)}
+    used = {view.image for k, view in enumerate(models.views) if (place.view == k).any()}
+    return {
+        "faces": len(areas),
+        "area": area(np.ones(len(areas), np.bool_)),
+        "area_seen": area(place.visible),
+        "area_painted": area(place.view >= 0),
+        "pictures": {
+            "used": len(used),
+            "usable": len(models.views),
+            "left_out": dict(models.left_out),
+            "unread": list(models.unread),
+        },
+        "pages": [list(page.shape[:2]) for page in models.textured.pages],
+        "objects": {"found": models.n_objects, "modelled": len(models.objects)},
+        **points,
     }
 
 

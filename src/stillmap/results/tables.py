@@ -1,7 +1,8 @@
 """Tables of a result: its beams, poses, moving objects and their tracks, as Arrow tables."""
 
-import importlib
 from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -9,9 +10,11 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import import_extra
+from stillmap.core.files import atomic_file
 from stillmap.core.local_frame import FAR
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import pose_rows
+from stillmap.results.mapped_place import MappedPlace
 from stillmap.results.reader import Track
 from stillmap.tracking import MovingObject
 from stillmap.tracking.objects import mean_speed, track_length
@@ -19,15 +22,13 @@ from stillmap.tracking.objects import mean_speed, track_length
 if TYPE_CHECKING:
     import pyarrow
 
-    from stillmap.results.result import Result
-
 Float = NDArray[np.float64]
 TableName = Literal["beams", "poses", "objects", "tracks"]
 
 _ROWS = 1 << 20  # of a part of the beams, approximately
 
 
-def make_table(result: "Result", name: TableName) -> "pyarrow.Table":
+def make_table(result: MappedPlace, name: TableName) -> "pyarrow.Table":
     """See `Result.to_arrow`.
 
     Raises:
@@ -40,20 +41,20 @@ def make_table(result: "Result", name: TableName) -> "pyarrow.Table":
     arrow = import_extra("pyarrow", "a table", "made", group="notebook")
     if name == "beams":
         poses, p_static = result.poses, result.p_static
-        schema = beam_schema(poses)
+        schema = _beam_schema(poses)
         recording, deskewed = result.recording, result.deskewed
         parts = [
-            arrow.table(beam_columns(recording, deskewed, poses, p_static, scans), schema)
-            for scans in split_scans(recording)
+            arrow.table(_beam_columns(recording, deskewed, poses, p_static, scans), schema)
+            for scans in _split_scans(recording)
         ]
         return arrow.concat_tables(parts) if parts else schema.empty_table()
     make = {"poses": _pose_columns, "objects": _object_columns, "tracks": _track_columns}[name]
     return arrow.table(make(result))
 
 
-def beam_schema(poses: Float) -> "pyarrow.Schema":
-    """Names and types of the columns of a beam; see `beam_columns`. `poses` (T, D+1, D+1)."""
-    arrow = importlib.import_module("pyarrow")
+def _beam_schema(poses: Float) -> "pyarrow.Schema":
+    """Names and types of the columns of a beam; see `_beam_columns`. `poses` (T, D+1, D+1)."""
+    arrow = import_module("pyarrow")
     length = arrow.float64() if _are_far(poses) else arrow.float32()
     kinds = {
         "scan": arrow.int32(),
@@ -72,7 +73,7 @@ def _are_far(poses: Float) -> bool:
     return bool(np.abs(poses[:, :-1, -1]).max(initial=0.0) > FAR)
 
 
-def beam_columns(
+def _beam_columns(
     recording: Recording,
     deskewed: Recording,
     poses: Float,
@@ -104,7 +105,7 @@ def beam_columns(
     }
 
 
-def split_scans(recording: Recording) -> Iterator[slice]:
+def _split_scans(recording: Recording) -> Iterator[slice]:
     """Ranges of scans of about a million beams together, at least one scan each."""
     first, T = 0, recording.n_scans
     while first < T:
@@ -114,7 +115,30 @@ def split_scans(recording: Recording) -> Iterator[slice]:
         first = end
 
 
-def _pose_columns(result: "Result") -> dict[str, NDArray[Any]]:
+def write_parquet(result: MappedPlace, path: Path) -> None:
+    """Write a row per beam of a 2D result, a row group for about a million beams.
+
+    Args:
+        result: labels and poses.
+        path: the file, written atomically.
+
+    Raises:
+        InputError: pyarrow is not installed, or the file cannot be written.
+    """
+    parquet = import_extra("pyarrow.parquet", path, "written")
+    arrow, recording, deskewed = import_module("pyarrow"), result.recording, result.deskewed
+    schema = _beam_schema(result.poses)
+    with (
+        atomic_file(path) as work,
+        work.open("wb") as file,  # not by name: it need not be UTF-8
+        parquet.ParquetWriter(file, schema, compression="zstd") as writer,
+    ):
+        for scans in _split_scans(recording):
+            columns = _beam_columns(recording, deskewed, result.poses, result.p_static, scans)
+            writer.write_table(arrow.table(columns, schema=schema), row_group_size=1 << 40)
+
+
+def _pose_columns(result: MappedPlace) -> dict[str, NDArray[Any]]:
     """A row per scan: `stamp_ns`, `x`, `y` and `theta`, or in 3D `z` and a quaternion."""
     poses = result.poses
     if poses.shape[-1] == 4:
@@ -125,7 +149,7 @@ def _pose_columns(result: "Result") -> dict[str, NDArray[Any]]:
     return {"stamp_ns": np.asarray(result.stamp_ns), **columns}
 
 
-def _object_columns(result: "Result") -> dict[str, Any]:
+def _object_columns(result: MappedPlace) -> dict[str, Any]:
     """A row per object: `id`, `first_stamp_ns`, `last_stamp_ns`, `length`, `width`, in 3D `height`
     (m), `distance` (m along its track), `speed` (m/s, mean), `beams`, `p_dynamic`, `p_identity`."""
     objects = result.objects
@@ -146,7 +170,7 @@ def _object_columns(result: "Result") -> dict[str, Any]:
     }
 
 
-def _track_columns(result: "Result") -> dict[str, NDArray[Any]]:
+def _track_columns(result: MappedPlace) -> dict[str, NDArray[Any]]:
     """A row per position of an object: `id`, `stamp_ns`, `x`, `y`, in 3D `z`, `vx`, `vy`."""
     objects = result.objects
     columns: dict[str, list[Any]] = {

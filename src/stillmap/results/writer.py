@@ -22,7 +22,7 @@ from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.reader import RECORD, TILTING
 from stillmap.results.region import crop_result, passes
 from stillmap.results.report.page import render_report
-from stillmap.results.run_json import run_record, tilting_record
+from stillmap.results.run_json import models_record, run_record, tilting_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -75,7 +75,7 @@ def save(
             _write_tilting(folder, tilting, colors, region, result.frame.origin)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
-            from stillmap.results.models import models_record, write_models
+            from stillmap.results.models import write_models
 
             images = (result if tilting is None else tilting).recording.images
             count = 0 if images is None else len(images)

@@ -159,8 +159,7 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises:
         InputError: the file cannot be read, or a line is not a pose.
     """
-    columns, _ = _first_row(path, _POSE)
-    if columns == 4:
+    if len(_first_row(path, _POSE)) == 4:
         rows = _rows(path, 4, "t x y theta")
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, [[0], [1], [3]], [0, 1, 3]] = se2.matrix(*rows[:, 1:].T)
@@ -197,8 +196,7 @@ def read_odometry(path: Path) -> Float:
     Raises:
         InputError: the file cannot be read or holds no odometry.
     """
-    _, is_log = _first_row(path, f"a CARMEN log or {_POSE}")
-    if not is_log:
+    if not _first_row(path, f"a CARMEN log or {_POSE}")[0][:1].isalpha():
         return read_planar_trajectory(path)
     log = read_log([path])
     if log.skipped_odometry.total:
@@ -228,22 +226,13 @@ def _log_rows(log: CarmenLog) -> Float:
     return np.zeros((0, 4))
 
 
-def _first_row(path: Path, wanted: str) -> tuple[int, bool]:
-    """Number of columns of the first row, and whether it starts with a word."""
+def _first_row(path: Path, wanted: str) -> list[str]:
+    """The words of the first row; # begins a comment."""
     text = read_head(path, _HEAD).decode("utf-8", "replace")
     for line in text.splitlines():
-        words = line.split("#")[0].split()
-        if words:
-            return len(words), not _is_number(words[0])
+        if words := line.split("#")[0].split():
+            return words
     raise InputError("holds no rows", where=str(path), hint=f"rows of {wanted}")
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _rows(path: Path, columns: int, names: str) -> Float:
@@ -252,23 +241,18 @@ def _rows(path: Path, columns: int, names: str) -> Float:
         lines = read_text(path, MAX_BYTES).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
-    rows = [
-        _row(words, columns, names, f"{path}:{number}")
-        for number, line in enumerate(lines, start=1)
-        if (words := line.split("#")[0].split())
-    ]
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split("#")[0].split()
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if words and (len(row) != columns or not all(map(math.isfinite, row))):
+            what = f"is no row of {columns} finite numbers"
+            raise InputError(what, where=f"{path}:{number}", hint=names)
+        if words:
+            rows.append(row)
     if not rows:
         raise InputError("holds no rows", where=str(path), hint=f"rows of {names}")
     return np.array(rows, np.float64)
-
-
-def _row(words: list[str], columns: int, names: str, where: str) -> list[float]:
-    if len(words) != columns:
-        raise InputError(f"has {len(words)} columns, not {columns}", where=where, hint=names)
-    try:
-        row = [float(word) for word in words]
-    except ValueError as error:
-        raise InputError("holds a word that is not a number", where=where, hint=names) from error
-    if not all(math.isfinite(value) for value in row):
-        raise InputError("holds a number that is not finite", where=where)
-    return row

@@ -1,36 +1,49 @@
 """Write a result as a ROS bag: scans with labels, map, trajectory, frames, moving objects."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.grid_map import limit_hits
+from stillmap.core.recording import Recording
+from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.ros import writer as ros
-from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF, BagKind
+from stillmap.io.ros.messages import LASER_SCAN, ODOMETRY, POINT_CLOUD, TF, BagKind
 from stillmap.io.ros.writer import (
     BASE,
     MAP,
     ODOM,
     BagWriter,
+    LaserScanEncoder,
     new_bag,
+    number_names,
     require_stamps,
     write_sensor_frames,
 )
-from stillmap.results.export.bag_objects import make_object_writer
-from stillmap.results.export.bag_scans import LaserWriter, LidarWriter, make_cloud_message
-from stillmap.results.folder import Exported
-from stillmap.results.point_cloud import cloud_from_recording
+from stillmap.results.mapped_place import MappedPlace
+from stillmap.results.object_poses import Mover, interpolate_pose, iter_present_tracks
+from stillmap.results.point_cloud import Block, cloud_from_recording
+from stillmap.results.points import FIELDS, PACKED_COLOUR, make_vertices
 
+Float = NDArray[np.float64]
 Progress = Callable[[float], None]
+ScanWriter = Callable[[int], None]
 
 _LOCAL = "map_local"  # a frame near the robot, where the map frame begins far away
 _MAX_POINTS = 1_000_000  # of the static cloud, which programs hold as one message
+_BOX_COLOR = (0.9, 0.4, 0.0, 0.8)  # RGBA, the orange of the report
+_TEXT_COLOR = (1.0, 1.0, 1.0, 1.0)  # RViz and Foxglove have a dark background
+_HEIGHT, _MIN_SIZE = 0.5, 0.1  # m, of the boxes: height in 2D, least edge
+_TEXT_HEIGHT, _TEXT_GAP = 0.3, 0.25  # m, of a letter, and above the box
+_CUBE, _TEXT, _ADD, _DELETE_ALL = 1, 9, 0, 3  # of visualization_msgs/Marker
 
 
 def write(
-    result: Exported,
+    result: MappedPlace,
     path: Path,
     kind: BagKind,
     *,
@@ -60,27 +73,32 @@ def write(
     """
     recording, stamps = result.recording, result.recording.stamp_ns.tolist()
     require_stamps(stamps[0], stamps[-1], kind)
-    scans = LaserWriter(result) if recording.dimension == 2 else LidarWriter(result)
+    encoder = LaserScanEncoder(recording) if recording.dimension == 2 else None
+    seen = recording if recording.dimension == 2 else result.deskewed
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        near = result.frame
+        near = result.loaded.frame
         more = [(MAP, _LOCAL, near.to_map(np.eye(4)))] if near.is_shifted else []
         frames = write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
-        if isinstance(scans, LidarWriter):
-            _write_static_points(bag, result, scans)
-        scans.open(bag, frames)
+        if encoder is None:
+            _write_static_points(bag, result, seen)
+            write_scan = _make_sweep_writer(bag, result, seen, frames)
+        else:
+            write_scan = _make_scan_writer(bag, result, encoder, frames)
         write_frames = _make_frame_writer(bag, result)
-        write_objects = make_object_writer(bag, result.tracks, recording.stamp_ns)
-        for t in recording.iter_scans(range(recording.n_scans), *scans.arrays):
+        write_objects = _make_object_writer(bag, result.objects, recording.stamp_ns)
+        read = (seen.points, result.p_static, result.colors)
+        arrays = [one for one in read if one is not None]
+        for t in recording.iter_scans(range(recording.n_scans), *arrays):
             write_frames(t)
-            scans.write(t)
+            write_scan(t)
             write_objects(t)
             if progress is not None:
                 progress((t + 1) / recording.n_scans)
-    return scans.describe_losses()
+    return [] if encoder is None else encoder.describe_losses()
 
 
-def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
+def _write_latched_topics(bag: BagWriter, result: MappedPlace) -> None:
     """Map and trajectory, as one latched message each."""
     stamp_ns, grid = result.recording.stamp_ns, result.map
     first = int(stamp_ns[0])
@@ -94,11 +112,11 @@ def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
     send(first, ros.make_path(bag, stamp_ns, result.poses))
 
 
-def _write_static_points(bag: BagWriter, result: Exported, scans: LidarWriter) -> None:
+def _write_static_points(bag: BagWriter, result: MappedPlace, deskewed: Recording) -> None:
     """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
     programs expect coordinates of 32 bits."""
-    near = result.frame
-    seen = limit_hits(scans.deskewed, result.poses, result.region)
+    near = result.loaded.frame
+    seen = limit_hits(deskewed, result.poses, result.loaded.region)
     cloud = cloud_from_recording(
         result.recording, seen, result.poses, result.p_static, "static", result.colors
     )
@@ -106,11 +124,55 @@ def _write_static_points(bag: BagWriter, result: Exported, scans: LidarWriter) -
     send = bag.add_topic("/static_points", POINT_CLOUD, latched=True)
     block = cloud.sample(_MAX_POINTS)
     block = block._replace(points=near.points_to_local(block.points))
-    frame = _LOCAL if near.is_shifted else MAP
-    send(first, make_cloud_message(bag, first, frame, block))
+    send(first, _make_cloud(bag, first, _LOCAL if near.is_shifted else MAP, block))
 
 
-def _make_frame_writer(bag: BagWriter, result: Exported) -> Callable[[int], None]:
+def _make_cloud(bag: BagWriter, stamp_ns: int, frame: str, block: Block) -> Any:
+    """A PointCloud2 of points in a frame: x, y, z, `p_static`, and `rgb` for colours."""
+    fields = FIELDS if block.colors is None else FIELDS + PACKED_COLOUR
+    return ros.make_point_cloud(bag, stamp_ns, frame, make_vertices(block, fields))
+
+
+def _make_scan_writer(
+    bag: BagWriter, result: MappedPlace, encoder: LaserScanEncoder, frames: Sequence[str]
+) -> ScanWriter:
+    """A function that writes a scan to the static and the dynamic topic of its laser: in each the
+    beams of the other one are NaN."""
+    recording, p_static = result.recording, result.p_static
+    names = [f"/{name}" for name in number_names("scan", len(frames))]
+    static = [bag.add_topic(name, LASER_SCAN) for name in names]
+    dynamic = [bag.add_topic(f"{name}_dynamic", LASER_SCAN) for name in names]
+
+    def write_scan(t: int) -> None:
+        s, stamp = int(recording.sensor[t]), int(recording.stamp_ns[t])
+        beams, ranges = recording.beams_of(t), encoder.ranges(t)
+        is_dynamic = recording.hit[beams] & (p_static[beams] < DYNAMIC_BELOW)
+        for sends, selected in ((static, ~is_dynamic), (dynamic, is_dynamic)):
+            part = np.where(selected, ranges, np.float32(np.nan))
+            sends[s](stamp, encoder.make_message(bag, t, frames[s], part))
+
+    return write_scan
+
+
+def _make_sweep_writer(
+    bag: BagWriter, result: MappedPlace, deskewed: Recording, frames: Sequence[str]
+) -> ScanWriter:
+    """A function that writes the returns of a sweep in the frame of its lidar at the stamp."""
+    names = number_names("points", len(frames))
+    sends = [bag.add_topic(f"/{name}", POINT_CLOUD) for name in names]
+
+    def write_sweep(t: int) -> None:
+        beams, s, stamp = deskewed.beams_of(t), int(deskewed.sensor[t]), int(deskewed.stamp_ns[t])
+        hit = deskewed.hit[beams]
+        colors = None if result.colors is None else result.colors[beams][hit]
+        points = deskewed.points[beams][hit].astype(np.float64)
+        block = Block(points, result.p_static[beams][hit], None, colors)
+        sends[s](stamp, _make_cloud(bag, stamp, frames[s], block))
+
+    return write_sweep
+
+
+def _make_frame_writer(bag: BagWriter, result: MappedPlace) -> ScanWriter:
     """A function that writes the frames, and the odometry, of a scan."""
     stamp_ns, T_odom_base = result.recording.stamp_ns, result.recording.T_odom_base
     send_tf = bag.add_topic("/tf", TF)
@@ -128,3 +190,77 @@ def _make_frame_writer(bag: BagWriter, result: Exported) -> Callable[[int], None
             send_odometry(stamp, ros.make_odometry(bag, stamp, T))
 
     return write_frames
+
+
+def _make_object_writer(
+    bag: BagWriter, tracks: Sequence[Mover], stamp_ns: NDArray[np.int64]
+) -> ScanWriter:
+    """A function that writes the markers at a scan; the scans (T,) come in order.
+
+    Each message begins with a marker that removes the earlier ones.
+    """
+    send = bag.add_topic("/objects", ros.MARKERS)
+    present_at, shown = iter_present_tracks(tracks, stamp_ns), list[int]()
+
+    def write_markers(t: int) -> None:
+        nonlocal shown
+        before, shown = shown, next(present_at)
+        if not before and not shown:
+            return
+        stamp = int(stamp_ns[t])
+        markers = [_make_marker(bag, stamp, {"action": _DELETE_ALL})]
+        for n in shown:
+            markers += _markers_of(bag, stamp, tracks[n])
+        send(stamp, bag.make(ros.MARKERS, markers=markers))
+
+    return write_markers
+
+
+def _markers_of(bag: BagWriter, stamp: int, track: Mover) -> list[Any]:
+    """Box and number of an object at the interpolated pose of its track."""
+    T = interpolate_pose(track, stamp)
+    length, width, height = (max(edge, _MIN_SIZE) for edge in (*track.size, _HEIGHT)[:3])
+    if track.z is None:
+        T[2, 3] = height / 2
+    above = np.eye(4)
+    above[:3, 3] = T[:3, 3] + (0.0, 0.0, height / 2 + _TEXT_GAP)
+    box = {"ns": "objects", "type": _CUBE, "size": (length, width, height), "color": _BOX_COLOR}
+    number = {"ns": "ids", "type": _TEXT, "size": (0.0, 0.0, _TEXT_HEIGHT), "color": _TEXT_COLOR}
+    return [
+        _make_marker(bag, stamp, {**box, "id": track.id}, T),
+        _make_marker(bag, stamp, {**number, "id": track.id, "text": str(track.id)}, above),
+    ]
+
+
+def _make_marker(bag: BagWriter, stamp: int, more: dict[str, Any], T: Float | None = None) -> Any:
+    """A Marker at a pose (4, 4) with `size`, `color` and other fields."""
+    x, y, z = more.pop("size", (1.0, 1.0, 1.0))
+    r, g, b, a = more.pop("color", _BOX_COLOR)
+    fields = {
+        "header": bag.header(stamp, MAP),
+        "ns": "objects",
+        "id": 0,
+        "type": _CUBE,
+        "action": _ADD,
+        "pose": ros.make_pose(bag, np.eye(4) if T is None else T),
+        "scale": bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        "color": bag.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
+        "lifetime": bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        "frame_locked": False,
+        "points": [],
+        "colors": [],
+        "text": "",
+        "mesh_resource": "",
+        "mesh_use_embedded_materials": False,
+    }
+    if not bag.is_ros1:
+        empty = np.empty(0, np.uint8)
+        image = {"header": bag.header(stamp, ""), "format": "", "data": empty}
+        mesh = {"filename": "", "data": empty}
+        fields |= {
+            "texture_resource": "",
+            "texture": bag.make("sensor_msgs/msg/CompressedImage", **image),
+            "uv_coordinates": [],
+            "mesh_file": bag.make("visualization_msgs/msg/MeshFile", **mesh),
+        }
+    return bag.make("visualization_msgs/msg/Marker", **(fields | more))

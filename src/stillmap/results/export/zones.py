@@ -1,24 +1,31 @@
 """Zones of a map as polygons in a GeoJSON file (RFC 7946), in metres in the map frame."""
 
+import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from annotated_types import Ge, Le, MinLen
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError, closest_match
+from stillmap.core.array_folder import parse
+from stillmap.core.errors import InputError
+from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Action = Literal["erase", "block", "keepout", "speed"]
 Polygon = list[Float]  # rings (n, 2), the last position equal to the first: outline, then holes
 
-_ACTIONS: tuple[Action, ...] = get_args(Action)
 _MAX_BYTES = 16 << 20
-_MAX_COORDINATE = 1e9  # m
 _MIN_PERCENT, _MIN_SPEED, _MAX_SPEED = 1.0, 0.01, 100.0  # m/s
-_MAX_NAME = 40  # characters in messages
+_Axis = Annotated[float, Ge(-1e9), Le(1e9)]  # m
+_Ring = Annotated[list[Annotated[list[_Axis], MinLen(2)]], MinLen(4)]
+_Polygons = Annotated[list[Annotated[list[_Ring], MinLen(1)]], MinLen(1)]
 
 
 class SpeedLimit(NamedTuple):
@@ -49,21 +56,47 @@ class Zone(NamedTuple):
     polygons: list[Polygon]
 
 
+@dataclass(frozen=True)
+class _Properties:
+    action: Action
+    speed: Any = None
+    name: Any = None
+
+
+@dataclass(frozen=True)
+class _Geometry:
+    type: Literal["Polygon", "MultiPolygon"]
+    coordinates: list[Any]
+
+
+@dataclass(frozen=True)
+class _Feature:
+    type: Literal["Feature"]
+    properties: _Properties
+    geometry: _Geometry
+
+
+@dataclass(frozen=True)
+class _Collection:
+    type: Literal["FeatureCollection"]
+    features: list[dict[str, Any]]
+
+
 def parse_speed_limit(value: object, where: str) -> SpeedLimit:
     """A limit from a number in m/s, or from text: `"0.5"` in m/s, `"50%"` of the maximum.
 
     Raises:
         InputError: it is none, or out of range.
     """
-    text = value.strip() if isinstance(value, str) else ""
+    text = str(value).strip()
     is_percent = text.endswith("%")
     try:
-        number = float(text.removesuffix("%") if isinstance(value, str) else _number(value))
-    except (ValueError, TypeError, OverflowError):
+        number = float(text.removesuffix("%"))
+    except ValueError:
         number = math.nan
     low, high = (_MIN_PERCENT, 100.0) if is_percent else (_MIN_SPEED, _MAX_SPEED)
     if not low <= number <= high:
-        what = f"{_short(value)} is no speed limit"
+        what = f"{value!r:.40} is no speed limit"
         hint = f"{_MIN_SPEED:g} to {_MAX_SPEED:g} in m/s, or '{_MIN_PERCENT:g}%' to '100%'"
         raise InputError(what, where=where, hint=hint)
     return SpeedLimit(number, is_percent)
@@ -78,81 +111,75 @@ def read_zones(path: Path) -> list[Zone]:
     Raises:
         InputError: names the file and the feature that is at fault.
     """
-    content = read_json(path, _MAX_BYTES)
-    features = content.get("features") if isinstance(content, dict) else None
-    if not isinstance(features, list) or content.get("type") != "FeatureCollection":
-        raise InputError("is no GeoJSON FeatureCollection", where=str(path))
-    return [_read_zone(one, path, number) for number, one in enumerate(features, start=1)]
+    content = parse(read_json(path, _MAX_BYTES), _Collection, path, "a GeoJSON FeatureCollection")
+    return [
+        _read_zone(one, Path(f"{path}: feature {number}"))
+        for number, one in enumerate(content.features, start=1)
+    ]
 
 
-def _read_zone(feature: Any, path: Path, number: int) -> Zone:
-    where = f"{path}: feature {number}"
-    if not isinstance(feature, dict) or feature.get("type") != "Feature":
-        raise InputError("is no Feature", where=where)
-    properties = feature.get("properties")
-    if not isinstance(properties, dict):
-        properties = {}
-    name = properties.get("name")
-    if isinstance(name, str) and name:
-        where = f"{where} {_short(name)}"
-    action, limit = _read_action(properties.get("action"), where), None
-    if action == "speed":
-        if "speed" not in properties:
-            hint = "a number in m/s, or a text such as '50%'"
-            raise InputError("has no property speed", where=where, hint=hint)
-        limit = parse_speed_limit(properties["speed"], where)
-    return Zone(where, action, limit, _read_polygons(feature.get("geometry"), where))
+def _read_zone(content: dict[str, Any], where: Path) -> Zone:
+    hint = f"its action is {', '.join(get_args(Action))}, its geometry Polygon or MultiPolygon"
+    feature = parse(content, _Feature, where, hint)
+    properties, coordinates = feature.properties, feature.geometry.coordinates
+    if isinstance(properties.name, str) and properties.name:
+        where = Path(f"{where} {properties.name!r:.40}")
+    if feature.geometry.type == "Polygon":
+        coordinates = [coordinates]
+    hint = "rings of four positions x, y in metres, or more, in the map frame"
+    polygons = [
+        [np.array([position[:2] for position in ring]) for ring in polygon]
+        for polygon in parse(coordinates, _Polygons, where, hint)
+    ]
+    if any((ring[0] != ring[-1]).any() for polygon in polygons for ring in polygon):
+        raise InputError("has a ring whose last position is not its first", where=str(where))
+    is_limit = properties.action == "speed"
+    limit = parse_speed_limit(properties.speed, str(where)) if is_limit else None
+    return Zone(str(where), properties.action, limit, polygons)
 
 
-def _read_action(name: object, where: str) -> Action:
-    for action in _ACTIONS:
-        if action == name:
-            return action
-    what = "has no action" if name is None else f"has the action {_short(name)}"
-    nearest = closest_match(name, _ACTIONS) if isinstance(name, str) else None
-    hint = f"do you mean {nearest!r}?" if nearest else f"a property: {', '.join(_ACTIONS)}"
-    raise InputError(what, where=where, hint=hint)
+def cells_inside(polygon: Sequence[Float], grid: GridMap) -> tuple[tuple[slice, slice], Mask]:
+    """The cells of a map whose centres lie inside a polygon.
+
+    Args:
+        polygon: rings (n, 2) in m in the map frame, closed: the outline, then holes.
+        grid: not turned: its yaw is 0.
+
+    Returns:
+        Rows and columns of the map around the polygon, and whether each cell there lies inside.
+    """
+    height, width = grid.p_occupied.shape
+    corner = np.array(grid.origin[:2])
+    # in cells: the centre of cell (row, column) is (column + 0.5, row + 0.5)
+    rings = [(ring - corner) / grid.resolution for ring in polygon]
+    low = np.floor(rings[0].min(axis=0)).clip(0, (width, height)).astype(int)
+    high = np.ceil(rings[0].max(axis=0)).clip(low, (width, height)).astype(int)
+    shape = (int(high[1] - low[1]), int(high[0] - low[0]))
+    inside, *holes = (_inside_ring(ring - low, shape) for ring in rings)
+    for hole in holes:
+        inside &= ~hole
+    return (slice(low[1], high[1]), slice(low[0], high[0])), inside
 
 
-def _read_polygons(geometry: Any, where: str) -> list[Polygon]:
-    kind = geometry.get("type") if isinstance(geometry, dict) else None
-    if kind not in ("Polygon", "MultiPolygon"):
-        what = "has no geometry" if geometry is None else f"is a {_short(kind)}"
-        raise InputError(what, where=where, hint="Polygon or MultiPolygon")
-    coordinates = geometry.get("coordinates")
-    polygons = [coordinates] if kind == "Polygon" else coordinates
-    try:
-        return [[_read_ring(ring) for ring in _list(one)] for one in _list(polygons)]
-    except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"has no usable coordinates: {error}", where=where) from error
+def is_within(polygon: Sequence[Float], grid: GridMap) -> bool:
+    """True if no part of a polygon lies outside the map."""
+    outline = (polygon[0] - np.array(grid.origin[:2])) / grid.resolution
+    beyond = outline - np.array(grid.p_occupied.shape[::-1])
+    return bool((outline >= -1e-6).all() and (beyond <= 1e-6).all())
 
 
-def _read_ring(positions: Any) -> Float:
-    """(n, 2) positions of a closed ring; heights are ignored."""
-    ring = np.array(
-        [[_number(axis) for axis in _list(position)[:2]] for position in _list(positions)]
-    )
-    if ring.ndim != 2 or ring.shape[1] != 2:
-        raise ValueError("a position without x and y")
-    if len(ring) < 4 or (ring[0] != ring[-1]).any():
-        raise ValueError("a ring of less than four positions, or whose last is not its first")
-    if not (np.abs(ring) <= _MAX_COORDINATE).all():
-        raise ValueError("beyond a million kilometres; they are metres in the map frame")
-    return ring
+def _inside_ring(ring: Float, shape: tuple[int, int]) -> Mask:
+    """Cells (h, w) whose centres lie inside a ring in cells, by the even-odd rule.
 
-
-def _list(value: object) -> list[Any]:
-    if not isinstance(value, list) or not value:
-        raise TypeError("not nested as the type of geometry wants it")
-    return value
-
-
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError("something else than a number")
-    return float(value)
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _MAX_NAME else f"{text[: _MAX_NAME - 3]}..."
+    Along a row, each edge that crosses the line through the centres changes inside to outside or
+    back from the first centre to the right of it.
+    """
+    h, w = shape
+    changes = np.zeros((h, w + 1), np.bool_)
+    for (x0, y0), (x1, y1) in itertools.pairwise(ring.tolist()):
+        # an edge holds its lower end, not its upper one: corners count once
+        first, last = (min(max(math.ceil(y - 0.5), 0), h) for y in sorted((y0, y1)))
+        row = np.arange(first, last)
+        x = x0 + (row + 0.5 - y0) * (x1 - x0) / (y1 - y0 or 1.0)
+        changes[row, np.ceil(x - 0.5).clip(0, w).astype(np.int64)] ^= True
+    return np.asarray(np.logical_xor.accumulate(changes, axis=1)[:, :w])

@@ -37,12 +37,12 @@ class MapView:
     Attributes:
         window: x0, y0, x1, y1 in m, in the map frame.
         size: width and height of the image in pixels.
-        reduced: whether several cells share a pixel.
+        factor: cells along the edge of a pixel.
     """
 
     window: Window
     size: tuple[int, int]
-    reduced: bool
+    factor: int = 1
 
     @classmethod
     def of(cls, maps: Sequence[GridMap], max_pixels: int = MAX_PIXELS) -> Self:
@@ -51,7 +51,12 @@ class MapView:
         factor = reduction_factor(window, resolution, max_pixels)
         x0, y0, x1, y1 = window
         width, height = (-(-round(d / resolution) // factor) for d in (x1 - x0, y1 - y0))
-        return cls(window, (width, height), factor > 1)
+        return cls(window, (width, height), factor)
+
+    @property
+    def reduced(self) -> bool:
+        """True if several cells share a pixel."""
+        return self.factor > 1
 
     @property
     def scale_bar(self) -> float:
@@ -176,7 +181,7 @@ def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     larger = max(1, _SNAPSHOT_PIXELS // max(levels.shape))
     pixels = levels.repeat(larger, axis=0).repeat(larger, axis=1)
     height, width = pixels.shape
-    view = MapView(extent(snapshot), (width, height), False)
+    view = MapView(extent(snapshot), (width, height))
     _put_dots(pixels, view.to_pixels(snapshot.dynamic_points), _ORANGE_INDEX, 3)
     return color_levels(pixels)
 
@@ -260,10 +265,10 @@ def _mostly(cells: Mask, among: Mask, factor: int) -> Mask:
 
 def count_in_squares(cells: Mask, factor: int) -> NDArray[np.int64]:
     """(h, w) number of true cells in squares of `factor` x `factor` cells."""
-    return np.asarray(_reduce_squares(np.add, cells, factor), np.int64)
+    return np.asarray(reduce_squares(np.add, cells, factor), np.int64)
 
 
-def _reduce_squares(ufunc: np.ufunc, cells: NDArray[Any], factor: int) -> NDArray[Any]:
+def reduce_squares(ufunc: np.ufunc, cells: NDArray[Any], factor: int) -> NDArray[Any]:
     """(h, w) values of squares of `factor` x `factor` cells, cut off at the borders."""
     rows, columns = (np.arange(0, n, factor) for n in cells.shape)
     return np.asarray(ufunc.reduceat(ufunc.reduceat(cells, rows, axis=0), columns, axis=1))
@@ -276,8 +281,8 @@ def reduce_levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     known cells.
     """
     known = count_in_squares(~np.isnan(cells), factor)
-    total = _reduce_squares(np.add, np.nan_to_num(cells.astype(np.float64)), factor)
-    largest = _reduce_squares(np.fmax, cells, factor)
+    total = reduce_squares(np.add, np.nan_to_num(cells.astype(np.float64)), factor)
+    largest = reduce_squares(np.fmax, cells, factor)
     shown = np.where(largest > OCCUPIED_THRESH, largest, total / np.maximum(known, 1))
     percent = np.rint(100.0 * np.clip(shown, 0.0, 1.0))
     return np.where(known > 0, percent, UNKNOWN_LEVEL).astype(np.uint8)

@@ -11,7 +11,6 @@ from PIL import Image
 
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
-from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.options import MapMode
@@ -30,6 +29,7 @@ from stillmap.results.report.figures import (
     draw_thinly_observed,
     iter_strips,
     reduce_levels,
+    reduce_squares,
 )
 from stillmap.results.run_json import known_area
 
@@ -127,10 +127,7 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
     every = max(1, math.ceil(len(poses) / _MAX_PATH_POINTS))
     area = known_area(result)
     return {
-        "view": view,
-        "meters": tuple(n * result.map.resolution for n in result.map.p_occupied.shape[::-1]),
-        "cell": result.map.resolution,
-        "written": written_data(result.map, result.options.output.map_mode, view),
+        **written_map_data(result.map, result.options.output.map_mode, view),
         "raw": data_uri(draw_map(result.raw_map, view.window)),
         "filtered": filtered.uri,
         "dynamic": data_uri(draw_points(ends, view)),
@@ -145,23 +142,28 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
     }
 
 
-def written_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
-    """The picture of the whole map, placed in percent of the view, and the bounds of both in m."""
+def written_map_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
+    """A map, its picture as written placed in percent of a view, and the bounds of both in m."""
     written = draw_written_map(occupancy, mode)
     x0, y0, x1, y1 = view.window
     left, bottom, right, top = written.window
     width, height = x1 - x0, y1 - y0
     return {
-        "image": data_uri(written.picture, optimize=True),
-        "size": written.picture.size,
-        "factor": written.factor,
-        "place": {
-            "left": 100 * (left - x0) / width,
-            "bottom": 100 * (bottom - y0) / height,
-            "width": 100 * (right - left) / width,
-            "height": 100 * (top - bottom) / height,
+        "view": view,
+        "meters": tuple(n * occupancy.resolution for n in occupancy.p_occupied.shape[::-1]),
+        "cell": occupancy.resolution,
+        "written": {
+            "image": data_uri(written.picture, optimize=True),
+            "size": written.picture.size,
+            "factor": written.factor,
+            "place": {
+                "left": 100 * (left - x0) / width,
+                "bottom": 100 * (bottom - y0) / height,
+                "width": 100 * (right - left) / width,
+                "height": 100 * (top - bottom) / height,
+            },
+            "bounds": (min(x0, left), min(y0, bottom), max(x1, right), max(y1, top)),
         },
-        "bounds": (min(x0, left), min(y0, bottom), max(x1, right), max(y1, top)),
     }
 
 
@@ -201,33 +203,14 @@ def _change_row(change: Change, start_ns: int) -> dict[str, Any]:
 
 def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
     """The changed cells in the colors of their kinds, transparent elsewhere."""
-    width, height = view.size
-    pixels = np.zeros((height, width), np.uint8)
-    row, column, kind = _changed_cells(result)
-    cell = result.map.resolution
-    low = np.stack([column, row], axis=1) * cell + np.array(result.map.origin[:2])
-    left, bottom = view.to_pixels(low).T
-    right, top = view.to_pixels(low + cell).T
-    # a cell covers several pixels or a part of one
-    steps = max(1, round(width * cell / (view.window[2] - view.window[0])))
-    for k in range(steps):
-        for m in range(steps):
-            x = np.floor(left + (k + 0.5) / steps * (right - left)).astype(np.int64)
-            y = np.floor(top + (m + 0.5) / steps * (bottom - top)).astype(np.int64)
-            inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            pixels[y[inside], x[inside]] = kind[inside]
-    return color_by_index(pixels, ((255, 255, 255), *(_COLORS[kind] for kind in CHANGED)), 0)
-
-
-def _changed_cells(result: MappingResult) -> tuple[NDArray[np.intp], ...]:
-    """Row, column and code of each changed cell."""
-    parts = []
-    for (rows, columns), codes in tiles_of(changed_cells(result.map, result.changes)):
-        row, column = np.nonzero(codes)
-        parts.append((row + rows.start, column + columns.start, codes[row, column]))
-    if not parts:
-        return tuple(np.zeros(0, np.intp) for _ in range(3))
-    return tuple(np.concatenate(some) for some in zip(*parts, strict=True))
+    codes: Any = changed_cells(result.map, result.changes)  # may be tiled
+    factor = view.factor
+    strips = [
+        reduce_squares(np.maximum, cells, factor)
+        for cells in iter_strips(result.map, codes, view.window, 0, factor)
+    ]
+    colors = ((255, 255, 255), *(_COLORS[kind] for kind in CHANGED))
+    return color_by_index(np.concatenate(strips)[::-1], colors, 0)
 
 
 def evolution_data(result: MappingResult) -> dict[str, Any] | None:
@@ -241,7 +224,7 @@ def evolution_data(result: MappingResult) -> dict[str, Any] | None:
             {
                 "number": one.number,
                 "dynamic": len(one.dynamic_points),
-                "view": MapView(extent(one), (image := draw_snapshot(one)).size, False),
+                "view": MapView(extent(one), (image := draw_snapshot(one)).size),
                 "image": data_uri(image),
             }
             for one in snapshots

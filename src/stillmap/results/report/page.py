@@ -1,27 +1,16 @@
-"""`report.html`: one self-contained page about a run, rendered from the Jinja2 templates beside."""
+"""`report.html` of a recording: what was mapped, from what, and how it went."""
 
-import base64
-import functools
-import hashlib
-import os
-import sys
 from collections.abc import Mapping
-from importlib.util import cache_from_source
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import iter_options
-from stillmap.core.files import package_version
+from stillmap.core.errors import split_advice
+from stillmap.core.json import to_jsonable
+from stillmap.mapping.beam_statistics import count_beams
+from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.report.estimation import calibration_data, convergence_data, fitted_data
-from stillmap.results.report.facts import (
-    files_data,
-    quality_data,
-    run_data,
-    source_data,
-    stages_data,
-)
-from stillmap.results.report.formatting import FILTERS
 from stillmap.results.report.maps import (
     changes_data,
     draw_filtered_map,
@@ -29,14 +18,49 @@ from stillmap.results.report.maps import (
     map_data,
 )
 from stillmap.results.report.objects import objects_data, rig_data
+from stillmap.results.report.template import render_page
+from stillmap.results.run_json import models_record
 
 if TYPE_CHECKING:
-    from jinja2 import BytecodeCache, Environment
-
     from stillmap.mesh.build import Models
     from stillmap.rig.build import TiltingResult
 
-_TEMPLATES = Path(__file__).parent / "templates"
+# files beside the report that are linked where they exist, with their content
+_FILES = {
+    "map.pgm": "the map, for map_server and nav2",
+    "map.png": "the map, for map_server and nav2",
+    "map.yaml": "its resolution and origin",
+    "map.npz": "probability of every cell, for NumPy",
+    "trajectory.tum": "where the robot was at every scan",
+    "graph.g2o": "pose graph, for g2o and GTSAM",
+    "static.ply": "points that stand still, in 3D",
+    "dynamic.ply": "points that moved, in 3D",
+    "mesh.glb": "surface of the place, in 3D",
+    "objects/objects.json": "moving objects and their tracks",
+    "traffic.npz": "how often each square was crossed",
+    "beams/p_static.npy": "probability of every beam to be static",
+    "run.json": "record of this run",
+}
+_NO_MORE: Mapping[str, str] = {}
+# what the stages of a run do
+_STAGES = {
+    "read": "reading the recording",
+    "calibration": "calibrating mounts and odometry",
+    "m_step": "estimating poses",
+    "e_step": "labelling beams",
+    "held_out": "testing on scans left out of the map",
+    "quality": "rating the quality",
+    "changes": "finding changed places",
+    "maps": "making the maps",
+    "evidence": "counting observations",
+    "objects": "tracking moving objects",
+    "tilting": "labelling the second laser",
+    "surface": "making the surface",
+    "painting": "choosing pictures for the surface",
+    "texture": "making textures",
+    "movers": "modelling moving objects",
+    "points": "coloring points",
+}
 
 
 def render_report(
@@ -55,9 +79,10 @@ def render_report(
     """
     filtered = draw_filtered_map(result)
     data = {
-        "run": run_data(result),
+        "run": (run := _run_data(result)),
+        "title": run["name"],
         "maps": map_data(result, filtered),
-        "quality": quality_data(result),
+        "quality": _quality_data(result),
         "files": files_data(folder),
         "changes": changes_data(result, filtered),
         "objects": objects_data(result, filtered),
@@ -68,17 +93,11 @@ def render_report(
         "calibration": calibration_data(result),
         "convergence": convergence_data(result),
         "evolution": evolution_data(result),
-        "source": source_data(result),
-        "stages": stages_data(result),
+        "source": _source_data(result),
+        "stages": _stages_data(result),
         "options": [(one.name, one.value) for one in iter_options(result.options)],
     }
-    return render_page("report.html.j2", data)
-
-
-def render_page(template: str, data: Mapping[str, Any]) -> str:
-    """A page from one of the templates."""
-    found = environment().get_template(template)
-    return found.render({**data, "version": package_version(), **script_data()})
+    return render_page(data)
 
 
 def _points_data(result: MappingResult, tilting: "TiltingResult | None") -> dict[str, Any] | None:
@@ -92,8 +111,6 @@ def _points_data(result: MappingResult, tilting: "TiltingResult | None") -> dict
 
 def _models_data(models: "Models") -> dict[str, Any]:
     """The record of the models, and why no image could texture anything; see `models_record`."""
-    from stillmap.results.models import models_record  # meshes take long to load
-
     record = models_record(models)
     pictures = record["pictures"]
     reasons = {**pictures["left_out"], "damaged": len(pictures["unread"])}
@@ -101,44 +118,83 @@ def _models_data(models: "Models") -> dict[str, Any]:
     return {**record, "untextured_reason": "" if record["area_painted"] else listed}
 
 
-@functools.cache
-def script_data() -> dict[str, str]:
-    """The page's script, and its hash, without which browsers run no script of the page."""
-    script = (_TEMPLATES / "map_view.js").read_text(encoding="utf-8")
-    digest = hashlib.sha256(script.encode()).digest()
-    return {"script": script, "script_hash": base64.b64encode(digest).decode("ascii")}
+def _run_data(result: MappingResult) -> dict[str, Any]:
+    """Title, headline figures and warnings."""
+    source, stamps, stages = result.recording.source, result.recording.stamp_ns, result.stages
+    path = source.path or ""
+    findings = [split_advice(text) for text in result.warnings]
+    return {
+        "name": Path(path).name or "recording",
+        "path": path,
+        "format": source.format or "",
+        "scans": result.recording.n_scans,
+        "skipped": source.n_skipped,
+        "beams": count_beams(result.recording, result.p_static),
+        "duration": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
+        "seconds": sum(float(stage.get("seconds") or 0) for stage in stages.values()),
+        "memory": max(
+            (stage.get("peak_memory_bytes") or 0 for stage in stages.values()), default=0
+        ),
+        "iterations": len(result.iterations),
+        "best": result.best_iteration,
+        "converged": result.converged,
+        "warnings": [(what, todo) for what, todo in findings if todo],
+        "notes": [what for what, todo in findings if not todo],
+        "estimator": result.options.estimator,
+        "dimension": result.recording.dimension,
+        "map_state": result.options.output.map_state,
+    }
 
 
-@functools.cache
-def environment() -> "Environment":
-    """The templates with the filters of `formatting`; HTML in data is escaped."""
-    # jinja2 is loaded only where a report is written
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    found = Environment(
-        bytecode_cache=_bytecode_cache(),
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    found.filters.update(FILTERS)
-    return found
+def _quality_data(result: MappingResult) -> list[tuple[str, float | None, str]]:
+    """Each part of the quality: its name, from 0 to 100 or None where it cannot be told, words."""
+    quality, words = result.quality, describe_quality(result.quality)
+    return [
+        ("Overall", quality.overall, _sentence_of(words.overall)),
+        ("Labels", quality.labels, _sentence_of(words.labels)),
+        ("Geometry", quality.geometry, _sentence_of(words.geometry)),
+    ]
 
 
-def _bytecode_cache() -> "BytecodeCache | None":
-    """Compiled templates, kept where Python keeps its modules; None: Python keeps none either.
+def _sentence_of(line: str) -> str:
+    """The words that follow the name and the figure of a part."""
+    return line.partition(": ")[2]
 
-    Compiling takes longer than rendering.
+
+def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[tuple[str, str]]:
+    """Names, relative to the report, and content of the files that a result folder has.
+
+    Args:
+        folder: None: no files.
+        more: names and content of files that only some results have, which come first.
     """
-    if sys.dont_write_bytecode:
-        return None
-    from jinja2 import FileSystemBytecodeCache
+    if folder is None:
+        return []
+    known = {**more, **_FILES, **more}
+    return [(name, what) for name, what in known.items() if (folder / name).is_file()]
 
-    folder = Path(cache_from_source(str(_TEMPLATES / "report.py"))).parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return FileSystemBytecodeCache(str(folder)) if os.access(folder, os.W_OK) else None
+
+def _stages_data(result: MappingResult) -> list[tuple[str, float, int]]:
+    """Name, seconds and peak memory in bytes of each stage."""
+    return [
+        (
+            _STAGES.get(name, name.replace("_", " ")),
+            float(stage.get("seconds") or 0),
+            int(stage.get("peak_memory_bytes") or 0),
+        )
+        for name, stage in result.stages.items()
+    ]
+
+
+def _source_data(result: MappingResult) -> dict[str, Any]:
+    """The reader's notes on the recording, without empty entries."""
+    source = to_jsonable(result.recording.source.to_dict())
+    skipped = {name: source.pop(name, None) or {} for name in ("skipped", "skipped_odometry")}
+    source.pop("warnings", None)  # shown at the top
+    return {
+        "entries": {k: v for k, v in source.items() if v not in ({}, [], None)},
+        **{
+            name: sorted(reasons.items(), key=lambda item: -int(item[1]["count"]))
+            for name, reasons in skipped.items()
+        },
+    }

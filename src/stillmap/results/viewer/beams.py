@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
 from stillmap.core.recording import Recording
+from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
 
 Float = NDArray[np.float64]
 
 MAX_BEAMS = 60_000  # shown of a scan
-_BLOCK_SCANS = 256  # deskewed at once
-_MAX_READ = 20_000_000  # beams read to find the dynamic ones, which takes seconds
 # scans before and after one from which it is deskewed; in 2D several lasers may take turns
 _NEIGHBORS = {2: 8, 3: 1}
 
@@ -70,23 +69,8 @@ class Beams:
         return ScanView(ends, p_static, origin)
 
     def dynamic_ends(self, max_count: int) -> Float:
-        """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns.
-
-        The recording is read in blocks of scans; of a long one not every block.
-        """
-        offset, T = self.recording.offset, self.recording.n_scans
-        first = np.arange(0, T, _BLOCK_SCANS)
-        use = first[sample_indices(len(first), max(1, _MAX_READ * len(first) // int(offset[-1])))]
-        ends = [self._dynamic_ends_of(int(n), min(int(n) + _BLOCK_SCANS, T)) for n in use]
-        found = np.concatenate([np.zeros((0, self.recording.dimension)), *ends])
-        return found[sample_indices(len(found), max_count)]
-
-    def _dynamic_ends_of(self, first: int, end: int) -> Float:
-        """Dynamic end points (n, D) of scans first:end."""
-        beams = slice(*self.recording.offset[[first, end]].tolist())
-        poses = self.poses[first:end]
-        block = deskew_recording(self.recording.slice_scans(first, end), poses, self.slam)
-        use = np.flatnonzero(block.hit & (self.p_static[beams] < 0.5))
-        ends = block.end_points(use, poses)
+        """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns."""
+        deskewed = deskew_recording(self.recording, self.poses, self.slam)
+        ends = sample_dynamic_points(deskewed, self.poses, self.p_static, max_count)
         self.recording.release_pages(self.p_static)
-        return ends
+        return ends.astype(np.float64)

@@ -12,6 +12,7 @@ from stillmap.results.colors import (
     BLUE,
     GREY,
     HEIGHT_COLORS,
+    KIND_COLORS,
     ORANGE,
     STATIC_COLORS,
     TEAL,
@@ -19,7 +20,6 @@ from stillmap.results.colors import (
     color_by_id,
 )
 from stillmap.results.report.figures import UNKNOWN
-from stillmap.results.report.place import KIND_COLORS
 from stillmap.results.viewer.layers import HEIGHT, PICTURES, Layers
 from stillmap.results.viewer.nodes import TEXT_STYLE
 from stillmap.results.viewer.server import Server

@@ -10,24 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
-from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.se2 import inverse
-from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.table import read_columns
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
 from stillmap.results.object_poses import interpolate_pose
-from stillmap.results.reader import Grid, Track, is_place, read_grid, read_tracks
+from stillmap.results.point_cloud import Cloud, Part, cloud_from_folder
+from stillmap.results.reader import SESSIONS, Grid, Track, is_place, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
-from stillmap.results.report.place import PlacePictures
+from stillmap.results.report.place_pictures import PlacePictures
 from stillmap.results.timeline import Timeline, read_timeline
 
 Float = NDArray[np.float64]
-MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
+MAX_POINTS: dict[Part, int] = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
 _MAX_MODELS = 256 << 20  # bytes of all object models
 _MAX_RECORD = 1 << 20  # bytes of objects/NNNN.json
@@ -53,40 +50,16 @@ class Points:
     total: int
 
 
-def sample_ply(path: Path, max_count: int) -> Points:
-    """At most `max_count` points of a PLY file, read block by block.
-
-    Raises:
-        InputError: it is missing or damaged.
-    """
-    layout = ply.read_layout(path)
-    has_colors = {"red", "green", "blue"} <= {field.name for field in layout.fields}
-    wanted = ("x", "y", "z", *(("red", "green", "blue") if has_colors else ()))
-    use, first = sample_indices(layout.rows, max_count), 0
-    points, colors = np.empty((len(use), 3)), np.empty((len(use), 3), np.uint8)
-    for block in read_columns(layout, wanted):
-        end = first + len(block[0])
-        into = slice(*np.searchsorted(use, [first, end]).tolist())
-        for n, values in enumerate(block):
-            (points if n < 3 else colors)[into, n % 3] = values[use[into] - first]
-        first = end
-    if not np.isfinite(points).all():
-        raise InputError("holds a point that is not finite", where=str(path))
-    return Points(points, colors if has_colors else None, layout.rows)
-
-
 @dataclass(frozen=True, eq=False)
 class ViewedPlace:
-    """A place of S sessions in the order of time.
+    """A place of several sessions.
 
     Attributes:
-        timeline: what changed between them.
-        first_scan: (S + 1,) session s has the scans first_scan[s]:first_scan[s + 1] of the scene.
+        timeline: the sessions in the order of time, and what changed between them.
         pictures: of the map; None for an empty one.
     """
 
     timeline: Timeline
-    first_scan: NDArray[np.intp]
     pictures: PlacePictures | None
 
     def __len__(self) -> int:
@@ -94,26 +67,8 @@ class ViewedPlace:
 
     def scans_of(self, session: int) -> range:
         """Indices of the scans of a session in the scene."""
-        return range(int(self.first_scan[session]), int(self.first_scan[session + 1]))
-
-
-def read_viewed_place(folder: Path, grid: GridMap) -> tuple[ViewedPlace, NDArray[np.int64], Float]:
-    """The sessions of a place, and stamps (T,) and poses (T, 4, 4) of all their scans.
-
-    Args:
-        folder: of the place.
-        grid: its map.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
-    timeline = read_timeline(folder)
-    homes = [folder / "sessions" / one.name for one in timeline.sessions]
-    trajectories = [read_tum(home / "trajectory.tum") for home in homes]
-    stamp_ns, poses = (np.concatenate(part) for part in zip(*trajectories, strict=True))
-    first_scan = np.cumsum([0, *(len(stamps) for stamps, _ in trajectories)])
-    pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
-    return ViewedPlace(timeline, first_scan, pictures), stamp_ns, poses
+        scans = self.timeline.sessions[session].scans
+        return range(scans.start, scans.stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +123,7 @@ class Scene:
         origin: (3,) whole m in the map frame; everything is drawn relative to it.
         ground: height of the map image in m.
         notes: what cannot be shown, and why.
-        place: the sessions of a place, in whose order the scans are; None: a single result.
+        place: the sessions of a place; None: a single result.
     """
 
     name: str
@@ -176,7 +131,7 @@ class Scene:
     stamp_ns: NDArray[np.int64]
     poses: Float
     map_image: MapImage | None
-    clouds: dict[str, Points]
+    clouds: dict[Part, Points]
     tracks: list[Track]
     surface: bytes | None
     models: list[Model]
@@ -202,15 +157,19 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
         InputError: map or trajectory are missing, or a file is damaged.
     """
     place, grid = None, read_grid(folder)
+    stamp_ns, poses = read_tum(folder / "trajectory.tum")
     if is_place(folder):
-        place, stamp_ns, poses = read_viewed_place(folder, grid)
-    else:
-        stamp_ns, poses = read_tum(folder / "trajectory.tum")
+        timeline = read_timeline(folder)
+        if any(one.scans.stop > len(poses) for one in timeline.sessions):
+            what = "is damaged: its scans are not those of the place"
+            raise InputError(what, where=str(folder / SESSIONS))
+        pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
+        place = ViewedPlace(timeline, pictures)
     origin = _origin(poses)
     raw = {
-        name: sample_ply(folder / f"{name}.ply", most)
-        for name, most in MAX_POINTS.items()
-        if (folder / f"{name}.ply").exists()
+        part: _sample(cloud_from_folder(folder, part), most)
+        for part, most in MAX_POINTS.items()
+        if (folder / f"{part}.ply").exists()
     }
     tracks, notes = read_tracks(folder / "objects" / "objects.json"), list[str]()
     surface = None
@@ -235,6 +194,11 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
         notes=notes,
         place=place,
     )
+
+
+def _sample(cloud: Cloud, most: int) -> Points:
+    block = cloud.sample(most)
+    return Points(block.points, block.colors, cloud.count)
 
 
 def _origin(poses: Float) -> Float:

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
-from stillmap.results.colors import color_by_id
+from stillmap.results.colors import KIND_COLORS, color_by_id
 from stillmap.results.object_poses import ObjectPoses
-from stillmap.results.report.place import KIND_COLORS
 from stillmap.results.timeline import SessionChange
 from stillmap.results.viewer.nodes import Labels, Nodes, escape_markdown, table_html
 from stillmap.results.viewer.objects import box_edges

@@ -1,9 +1,70 @@
-"""Numbers as text: the filters of the report's templates."""
+"""Pages rendered from the Jinja2 templates beside, and numbers as text: their filters."""
 
+import base64
+import functools
+import hashlib
 import math
+import os
+import sys
+from collections.abc import Mapping
+from importlib.util import cache_from_source
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stillmap.core.files import package_version
+
+if TYPE_CHECKING:
+    from jinja2 import BytecodeCache, Environment
+
+_TEMPLATES = Path(__file__).parent / "templates"
 
 # entries of a recording's notes that are angles in rad
 _ANGLES = {"angle_step", "pitch", "roll", "start_angle", "theta", "yaw"}
+
+
+def render_page(data: Mapping[str, Any], template: str = "report.html.j2") -> str:
+    """A page: no outside request, images and script inline."""
+    script = (_TEMPLATES / "map_view.js").read_text(encoding="utf-8")
+    # without its hash, browsers run no script of the page
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    known = {"run": None, "place": None, "script": script, "script_hash": digest}
+    page = _environment().get_template(template)
+    return page.render({**known, **data, "version": package_version()})
+
+
+@functools.cache
+def _environment() -> "Environment":
+    """The templates with the filters below; HTML in data is escaped."""
+    # jinja2 is loaded only where a report is written
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    found = Environment(
+        bytecode_cache=_bytecode_cache(),
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.filters.update(FILTERS)
+    return found
+
+
+def _bytecode_cache() -> "BytecodeCache | None":
+    """Compiled templates, kept where Python keeps its modules; None: Python keeps none either.
+
+    Compiling takes longer than rendering.
+    """
+    if sys.dont_write_bytecode:
+        return None
+    from jinja2 import FileSystemBytecodeCache
+
+    folder = Path(cache_from_source(str(_TEMPLATES / "report.py"))).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return FileSystemBytecodeCache(str(folder)) if os.access(folder, os.W_OK) else None
 
 
 def format_share(share: float) -> str:

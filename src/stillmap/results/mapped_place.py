@@ -1,0 +1,234 @@
+"""A mapped place of one session or several: what was just built, or a folder that was opened."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.core.grid_map import GridMap
+from stillmap.core.recording import Recording
+from stillmap.io.trajectory import read_tum
+from stillmap.pipeline.options import Options
+from stillmap.pipeline.quality import Quality
+from stillmap.pipeline.result import MappingResult
+from stillmap.prepare.beam_times import add_beam_times
+from stillmap.results.folder import ResultFolder, match_labels, open_result
+from stillmap.results.reader import (
+    SESSIONS,
+    TILTING,
+    Labels,
+    Track,
+    is_place,
+    read_colors,
+    read_grid,
+    read_labels,
+    read_run,
+    read_tracks,
+)
+from stillmap.results.run_json import run_record
+from stillmap.results.timeline import (
+    PlaceSession,
+    SessionChange,
+    read_changes,
+    read_sessions,
+    read_states,
+)
+from stillmap.slam import deskew_recording
+from stillmap.tracking import MovingObject
+
+Float = NDArray[np.float64]
+PathLike: TypeAlias = str | os.PathLike[str]
+Source: TypeAlias = Recording | PathLike | Sequence[PathLike]
+
+
+@dataclass(eq=False, repr=False)
+class MappedPlace:
+    """The data of a mapped place; `stillmap.Result` says what each is."""
+
+    map: GridMap
+    poses: Float
+    stamp_ns: NDArray[np.int64]
+    p_static: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    objects: Sequence[MovingObject | Track]
+    sessions: list[PlaceSession]
+    changes: list[SessionChange]
+    mapping: MappingResult | None = None
+    folder: ResultFolder | None = None
+    source: Recording | str | Sequence[PathLike] | None = None
+
+    @classmethod
+    def of(cls, mapping: MappingResult) -> Self:
+        """A recording that was just mapped."""
+        recording = mapping.recording
+        return cls(
+            map=mapping.map,
+            poses=mapping.poses,
+            stamp_ns=recording.stamp_ns,
+            p_static=mapping.p_static,
+            hit=recording.hit,
+            objects=mapping.objects,
+            sessions=[_only_session(recording.source.path, recording.stamp_ns, mapping.poses)],
+            changes=[],
+            mapping=mapping,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        mapping = None if name.startswith("__") else self.__dict__.get("mapping")
+        if mapping is None:
+            raise AttributeError(f"a {type(self).__name__} has no {name}")
+        return getattr(mapping, name)
+
+    @classmethod
+    def open(cls, path: PathLike, recording: Source | None = None) -> Self:
+        """See `stillmap.load`."""
+        folder, has_several = Path(path), is_place(Path(path))
+        if has_several and recording is not None:
+            hint = "load_session(NAME, recording=PATH) says where that of one session is"
+            raise InputError("is a place of several recordings", where=str(path), hint=hint)
+        record, labels = read_run(folder), read_labels(folder)
+        opened = ResultFolder(folder, record, source_given=recording is not None)
+        poses, changes = _read_poses(opened, labels), list[SessionChange]()
+        noted = record["input"].get("path")
+        read_from = noted if isinstance(noted, str) and noted else None
+        sessions = [_only_session(read_from, labels.stamp_ns, poses)]
+        if has_several:
+            sessions = read_sessions(folder)
+            changes = read_changes(folder, read_states(folder)[1])
+        result = cls(
+            map=read_grid(folder),
+            poses=poses,
+            stamp_ns=labels.stamp_ns,
+            p_static=labels.p_static,
+            hit=labels.hit,
+            objects=read_tracks(folder / "objects" / "objects.json"),
+            sessions=sessions,
+            changes=changes,
+            folder=opened,
+            source=os.fspath(recording) if isinstance(recording, os.PathLike) else recording,
+        )
+        ends = [0, *(scans.stop for scans in result.stretches)]
+        if [scans.start for scans in result.stretches] != ends[:-1] or ends[-1] != len(poses):
+            what = "is damaged: its scans are not those of the place"
+            raise InputError(what, where=str(folder / SESSIONS))
+        return result
+
+    @property
+    def path(self) -> Path | None:
+        """The folder that it was loaded from; None: it was built."""
+        return None if self.folder is None else self.folder.folder
+
+    @property
+    def run(self) -> dict[str, Any]:
+        """The content of `run.json`."""
+        return self.loaded.record if self.mapping is None else run_record(self.mapping)
+
+    @property
+    def quality(self) -> Quality:
+        """Of labels and geometry, from 0 to 100; None where it cannot be told."""
+        return self.loaded.quality if self.mapping is None else self.mapping.quality
+
+    @property
+    def warnings(self) -> list[str]:
+        """One sentence each."""
+        if self.mapping is not None:
+            return self.mapping.warnings
+        return list(self.run.get("warnings") or [])
+
+    @property
+    def options(self) -> Options:
+        """Every option as resolved.
+
+        Raises:
+            InputError: this version does not know them.
+        """
+        return self.loaded.options if self.mapping is None else self.mapping.options
+
+    @cached_property
+    def recording(self) -> Recording:
+        """The recording as it was mapped; of one that was loaded, read when it is first used.
+
+        Raises:
+            InputError: it is not there, is not the one that was mapped, or there are several.
+        """
+        if self.mapping is not None:
+            return self.mapping.recording
+        folder = self.loaded
+        if len(self.stretches) > 1:
+            hint = "load_session(NAME).recording is that of one session"
+            raise InputError("is a place of several recordings", where=str(self.path), hint=hint)
+        if isinstance(self.source, Recording):
+            mapped = match_labels(self.source, read_labels(folder.folder), "recording")
+            # read from a file, it would have them already
+            recording = add_beam_times(mapped, folder.read_options.spin)
+        else:
+            recording, _ = open_result(folder.folder, self.source).read()
+        if recording.dimension != self.poses.shape[-1] - 1:
+            what = f"is in {recording.dimension}D, another dimension than the result"
+            raise InputError(what, where="recording")
+        return folder.calibrate(recording)
+
+    @property
+    def deskewed(self) -> Recording:
+        """The recording without the motion during its scans, computed at every call."""
+        if self.mapping is not None:
+            return self.mapping.deskewed
+        return deskew_recording(self.recording, self.poses, self.loaded.slam_options)
+
+    @cached_property
+    def colors(self) -> NDArray[np.uint8] | None:
+        """(M, 3) of the end points of one that was opened; None: without."""
+        return read_colors(self.loaded.folder, len(self.hit)) if self.poses.shape[-1] == 4 else None
+
+    @property
+    def loaded(self) -> ResultFolder:
+        """The folder of one that was opened."""
+        assert self.folder is not None
+        return self.folder
+
+    @property
+    def stretches(self) -> list[slice]:
+        """The scans of each session that is in the place, in their order."""
+        placed = [one.scans for one in self.sessions if one.accepted]
+        return sorted(placed, key=lambda scans: int(scans.start))
+
+
+def _only_session(path: str | None, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
+    """The session of a result of one recording, whose frame is the map frame."""
+    D = poses.shape[-1] - 1
+    times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
+    return PlaceSession(
+        input_stem(Path(path)) if path else "session",
+        path,
+        True,
+        T_place_session=np.eye(D + 1),
+        covariance=np.zeros((3 * (D - 1), 3 * (D - 1))),
+        scans=slice(0, len(stamp_ns)),
+        first_ns=times[0],
+        last_ns=times[1],
+    )
+
+
+def input_stem(path: Path) -> str:
+    """The name of an input without endings."""
+    name = Path(os.path.abspath(path)).name
+    return name.split(".")[0] or name
+
+
+def _read_poses(opened: ResultFolder, labels: Labels) -> Float:
+    """(T, D+1, D+1) T_map_base."""
+    path = opened.folder / "trajectory.tum"
+    stamp_ns, poses = read_tum(path)
+    if not np.array_equal(stamp_ns, labels.stamp_ns):
+        what = f"has {len(stamp_ns)} poses, not one for each of {len(labels.stamp_ns)} scans"
+        raise InputError(what, where=str(path))
+    # a rig with a tilting laser writes clouds, but its map is that of the planar one
+    is_3d = opened.dimension == 3 and not (opened.folder / TILTING).is_dir()
+    return poses if is_3d else se2.project_to_plane(poses)
