@@ -41,8 +41,8 @@ def dump(array: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-# written anew by every merge, so that nobody needs to read them
-OUTPUTS = ("trajectory.tum", "beams/p_static.npy", "objects/")
+# written anew by every merge, so that nobody needs to read them; clouds are read when they are moved
+OUTPUTS = ("trajectory.tum", "beams/p_static.npy", "objects/", "state/objects/")
 
 
 @pytest.mark.slow
