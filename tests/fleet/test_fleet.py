@@ -1,5 +1,7 @@
 """What a fleet does with its tasks; what the tasks do is a stand-in's."""
 
+import errno
+import fcntl
 import json
 import os
 
@@ -101,21 +103,20 @@ def test_result_of_something_else_is_made_again(stand_in, logs, tmp_path, change
 
 
 def test_bad_recording_is_named_and_the_rest_goes_on(stand_in, logs, tmp_path):
-    folder, out = logs(a="fine", b="bad", c="defect", d="fine", e="full"), tmp_path / "out"
+    folder, out = logs(a="fine", b="bad", c="defect", d="fine"), tmp_path / "out"
     done = stand_in(folder, folder / "missing.clf", "-o", out, "--quiet", "--json")
     assert done.returncode == 3
     entries = listed(done)
     assert {name for name, one in entries.items() if one["status"] == "done"} == {"a", "d"}
     assert entries["b"]["why"] == f"{folder / 'b.clf'}: no two scans"
     assert entries["c"]["why"] == "a defect of stillmap: ValueError(7)"
-    assert entries["e"]["why"].endswith("No space left on device")
     assert entries["missing"]["why"] == f"{folder / 'missing.clf'}: does not exist"
     assert entries["b"]["result"] is None
     assert sorted(done.stderr.splitlines()) == [
-        f"stillmap: {name}: {entries[name]['why']}" for name in ("b", "c", "e", "missing")
+        f"stillmap: {name}: {entries[name]['why']}" for name in ("b", "c", "missing")
     ]
     page = (out / "fleet.html").read_text()
-    assert "2 of 6 recordings mapped" in page
+    assert "2 of 5 recordings mapped" in page
     assert "no two scans" in page
     assert sorted(os.listdir(out / "results")) == ["a", "d"]
 
@@ -187,6 +188,43 @@ def test_foreign_folder_is_refused(stand_in, logs, tmp_path):
     assert done.returncode == 2
     assert f"{out}: already holds something" in done.stderr
     assert os.listdir(out) == ["thesis.tex"]
+
+
+def test_full_disk_stops_the_fleet_with_one_line(stand_in, logs, tmp_path):
+    folder, out = logs(a="fine and long", b="full"), tmp_path / "out"
+    done = stand_in(folder, "-o", out, "--quiet")
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("stillmap: b: cannot continue: ")
+    assert "No space left on device (make room, then continue with the same command)" in line
+    assert not (out / "fleet.json").exists()
+    (folder / "b.clf").write_text("fine")
+    assert stand_in(folder, "-o", out, "--quiet").returncode == 0
+
+
+def test_two_fleets_in_one_folder(stand_in, logs, tmp_path):
+    folder, out = logs(a="fine"), tmp_path / "out"
+    out.mkdir()
+    with (out / ".lock").open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        done = stand_in(folder, "-o", out)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"stillmap: {out}: another fleet is writing there (wait for it, or stop it)\n"
+    )
+    assert os.listdir(out) == [".lock"]
+    assert stand_in(folder, "-o", out, "--quiet").returncode == 0
+    assert sorted(os.listdir(out)) == ["fleet.html", "fleet.json", "results"]
+
+
+def test_folder_that_cannot_be_written(stand_in, logs, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr("stillmap.core.input_files.open_lock", refuse)
+    done = stand_in(logs(a="fine"), "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stderr == f"stillmap: {tmp_path / 'out'}: cannot be written: Permission denied\n"
 
 
 @pytest.mark.parametrize(

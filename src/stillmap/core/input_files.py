@@ -6,12 +6,14 @@ is an error. That is why none is memory-mapped: a page of which the file has los
 be read any more, and the attempt ends the process.
 """
 
+import fcntl
 import io
 import os
 import shutil
 import stat
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from stillmap.core.errors import InputError
 
@@ -149,3 +151,33 @@ def copy_file(source: str | os.PathLike[str], target: str | os.PathLike[str]) ->
     """Copy a file with its permissions and dates; see `copy_content`."""
     copy_content(source, target)
     shutil.copystat(source, target)
+
+
+def hold_lock(path: Path, what: str, where: str) -> IO[bytes]:
+    """Lock a file, which is made with its folder; the kernel unlocks it when this process ends.
+
+    Args:
+        path: of the lock file, which its holder may remove.
+        what: of the error where another process holds the lock.
+        where: the output that it guards, of that error.
+
+    Raises:
+        InputError: another process holds the lock, or the file is no regular one.
+        OSError: the file cannot be made.
+    """
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # the process that had it has just ended
+            if path.exists():
+                require_regular(path)  # to open a pipe would wait for its reader
+            file = path.open("ab")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.close()
+                raise InputError(what, where=where, hint="wait for it, or stop it") from error
+            except OSError:
+                pass  # a file system without locks
+            if os.path.samestat(os.stat(path), os.fstat(file.fileno())):
+                return file
+            file.close()

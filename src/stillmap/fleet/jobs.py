@@ -40,7 +40,7 @@ class Outcome:
     """How a task ended.
 
     Attributes:
-        status: `done` or `failed`.
+        status: `done`, `failed`, or `full`: a disk is, and no task can go on.
         why: one line; empty where it is done.
         key: of what the result was made from.
         input: its recording, or the first of them.
@@ -49,7 +49,7 @@ class Outcome:
         summary: of the result, JSON-able.
     """
 
-    status: Literal["done", "failed"]
+    status: Literal["done", "failed", "full"]
     why: str = ""
     key: str = ""
     input: str = ""

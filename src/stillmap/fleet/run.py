@@ -2,14 +2,16 @@
 
 import hashlib
 import logging
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from stillmap.core.errors import InputError, import_extra
+from stillmap.core.errors import InputError, cannot_write, import_extra
 from stillmap.core.files import atomic_file, package_version, resolve_output, to_encodable
+from stillmap.core.input_files import hold_lock
 from stillmap.core.json import to_json
 from stillmap.fleet.inputs import Source, find_sources
 from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
@@ -18,6 +20,7 @@ from stillmap.fleet.page import render_page
 from stillmap.fleet.tasks import STAGING, Task, read_made, run_task
 
 LIST, PAGE = "fleet.json", "fleet.html"
+_LOCK = ".lock"
 # Ctrl-C at a terminal reaches all processes: the client alone ends its workers
 _PRELOAD = ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]
 _TIMEOUT = 15  # s for the scheduler to answer
@@ -27,29 +30,28 @@ def run_fleet(request: Request) -> Fleet:
     """Map every recording, merge each place, and write `fleet.json` and `fleet.html`.
 
     Raises:
-        InputError: the output is taken or in use, an input holds no recording, the storage refuses,
-            no scheduler answers. What was finished stays, and the same request goes on from there.
+        InputError: the output is taken, in use or cannot be written, an input holds no recording,
+            the storage refuses, a disk is full, no scheduler answers. What was finished stays, and
+            the same request goes on from there.
         KeyboardInterrupt: likewise.
     """
     root = absolute(request.output)
     if is_local(request.output):
         root = str(resolve_output(Path(root)))
     _require_fleet(root)
-    sources = find_sources(request.entries, _known_names(root))
-    if is_local(root):  # refused before anything is mapped
-        with explain(root, "written"):
-            Path(root).mkdir(parents=True, exist_ok=True)
-    with _remove_unfinished(root, request), _open_client(request) as client:
-        tasks = [
-            Task("map", source.name, (source.input,), root, request.map_flags)
-            for source in sorted(sources, key=_size, reverse=True)
-        ]
-        mapped = _run_tasks(client, tasks, request)
-        jobs = [Job(source, mapped[source.name]) for source in sources]
-        places = _merge_places(client, jobs, root, request)
-    fleet = Fleet(jobs, places)
-    _write(root, LIST, to_json(fleet.to_list(), indent=2) + "\n")
-    _write(root, PAGE, to_encodable(render_page(fleet)))
+    with _hold_output(root):
+        sources = find_sources(request.entries, _known_names(root))
+        with _remove_unfinished(root, request), _open_client(request) as client:
+            tasks = [
+                Task("map", source.name, (source.input,), root, request.map_flags)
+                for source in sorted(sources, key=_size, reverse=True)
+            ]
+            mapped = _run_tasks(client, tasks, request)
+            jobs = [Job(source, mapped[source.name]) for source in sources]
+            places = _merge_places(client, jobs, root, request)
+        fleet = Fleet(jobs, places)
+        _write(root, LIST, to_json(fleet.to_list(), indent=2) + "\n")
+        _write(root, PAGE, to_encodable(render_page(fleet)))
     return fleet
 
 
@@ -62,9 +64,38 @@ def _require_fleet(root: str) -> None:
         if not fs.isdir(path):
             raise InputError("is in the way: not a folder", where=root)
         names = {str(one).rstrip("/").rpartition("/")[2] for one in fs.ls(path, detail=False)}
-    if names - {RESULTS, PLACES, LIST, PAGE, path.rpartition("/")[2]}:
+    if names - {RESULTS, PLACES, LIST, PAGE, _LOCK, path.rpartition("/")[2]}:
         hint = "choose another; a fleet's own folder is continued"
         raise InputError("already holds something", where=root, hint=hint)
+
+
+@contextmanager
+def _hold_output(root: str) -> Iterator[None]:
+    """Keep other fleets out of a folder while the block runs; a URL has no locks.
+
+    Raises:
+        InputError: another fleet is writing there, or nothing can be written.
+    """
+    fs, path = open_location(root)
+    if not is_local(root):
+        _write(root, _LOCK, "")
+        with explain(root, "written"):
+            fs.rm_file(f"{path}/{_LOCK}")
+        yield
+        return
+    folder, was_there = Path(path), os.path.lexists(path)
+    try:
+        file = hold_lock(folder / _LOCK, "another fleet is writing there", root)
+    except OSError as error:
+        raise cannot_write(error, root) from error
+    try:
+        yield
+    finally:
+        (folder / _LOCK).unlink(missing_ok=True)
+        with suppress(OSError):  # it holds something
+            if not was_there:
+                folder.rmdir()
+        file.close()
 
 
 def _known_names(root: str) -> dict[str, str]:
@@ -162,6 +193,9 @@ def _run_tasks(client: Any, tasks: Sequence[Task], request: Request) -> dict[str
         future = next(ended)
         task = running.pop(future)
         outcome = outcomes[task.name] = _outcome(future, client, request)
+        if outcome.status == "full":
+            hint = "make room, then continue with the same command"
+            raise InputError(f"cannot continue: {outcome.why}", where=task.name, hint=hint)
         if not outcome.is_done:
             request.fail(f"{'place ' * (task.command == 'merge')}{task.name}: {outcome.why}")
         what = "mapping" if task.command == "map" else "merging"

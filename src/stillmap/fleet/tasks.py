@@ -5,6 +5,7 @@ then takes its place; `made.json` in it says what it was made from. It is made a
 differs.
 """
 
+import errno
 import hashlib
 import html
 import json
@@ -34,6 +35,7 @@ from stillmap.results.report.figures import data_uri, draw_map, map_window
 MADE = "made.json"  # of each result of a fleet
 STAGING = ".part-"  # begins the names of unfinished results
 _MAX_BYTES = 1 << 30  # of a record or report
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _outcome = TypeAdapter(Outcome)
 _PIXELS, _GREYS = 90_000, 16  # of the small map of the page, at most
 
@@ -77,11 +79,21 @@ def run_task(task: Task, command: Callable[[list[str]], None]) -> Outcome:
     try:
         return _make(task, command)
     except InputError as error:
-        return Outcome("failed", str(error))
+        return Outcome("full" if _is_disk_full(error) else "failed", str(error))
     except OSError as error:
-        return Outcome("failed", f"{error.filename or 'the result'}: {error.strerror or error}")
+        why = f"{error.filename or 'the result'}: {error.strerror or error}"
+        return Outcome("full" if _is_disk_full(error) else "failed", why)
     except Exception as error:  # of one task: the others go on
         return Outcome("failed", f"a defect of stillmap: {error!r}")
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
+    """True if an error, or what it comes from, is that of a full disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+            return True
+        error = error.__cause__
+    return False
 
 
 def _make(task: Task, command: Callable[[list[str]], None]) -> Outcome:

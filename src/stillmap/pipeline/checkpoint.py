@@ -5,7 +5,6 @@ options, and a hash of its input. The folder is locked while the run lasts.
 """
 
 import dataclasses
-import fcntl
 import hashlib
 import math
 import os
@@ -13,7 +12,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ from stillmap.core.arrays import iter_bytes
 from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import hidden_path, package_version, remove, resolve_output
-from stillmap.core.input_files import require_regular
+from stillmap.core.input_files import hold_lock
 from stillmap.core.interrupts import defer_signals
 from stillmap.core.json import to_jsonable
 from stillmap.core.profiling import StageTimer
@@ -134,7 +133,8 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     checkpoints = CheckpointFolder(hidden_path(output, "resume"))
     made = [path for path in output.parents if not path.exists()]
     try:
-        file = _lock(checkpoints.folder, given)
+        what = "another run is writing there"
+        file = hold_lock(checkpoints.folder / _LOCK, what, str(given))
     except OSError as error:
         raise cannot_write(error, given) from error
     try:
@@ -146,27 +146,6 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
                 for path in made:
                     path.rmdir()
         file.close()
-
-
-def _lock(folder: Path, output: Path) -> IO[bytes]:
-    """The open lock file, which the kernel unlocks when this process ends."""
-    while True:
-        folder.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):  # the run that had it has just ended
-            if (folder / _LOCK).exists():
-                require_regular(folder / _LOCK)  # to open a pipe would wait for its reader
-            file = (folder / _LOCK).open("ab")
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                file.close()
-                what, hint = "another run is writing there", "wait for it, or stop it"
-                raise InputError(what, where=str(output), hint=hint) from error
-            except OSError:
-                pass  # a file system without locks
-            if os.path.samestat(os.stat(folder / _LOCK), os.fstat(file.fileno())):
-                return file
-            file.close()
 
 
 def _pack(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
