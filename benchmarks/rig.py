@@ -28,8 +28,8 @@ from tables import Column, means_and_worst
 
 import stillmap
 from stillmap.core import config
+from stillmap.pipeline.tilting import PlanarResult, TiltingResult, build_tilting
 from stillmap.results.eval.labels import score_labels
-from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting
 from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
 
 WORLDS: dict[str, dict[str, Any]] = {

@@ -84,7 +84,6 @@ _ROOMS = (
     "places",
     "prepare",
     "results",
-    "rig",
     "sim",
     "slam",
     "tracking",

@@ -6,9 +6,9 @@ from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
-from stillmap.rig import build
-from stillmap.rig.build import PlanarResult, apply_boxes, build_tilting
-from stillmap.rig.removal import BoxBeams, object_height
+from stillmap.pipeline import tilting
+from stillmap.pipeline.tilting import PlanarResult, apply_boxes, build_tilting
+from stillmap.pipeline.tilting_boxes import BoxBeams, object_height
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_boxes
 
@@ -137,8 +137,8 @@ def test_only_beams_in_boxes_are_dynamic():
 
 
 def test_evidence_and_boxes_multiply_their_odds(monkeypatch):
-    monkeypatch.setattr(build, "_P_INSIDE", 0.9)
-    monkeypatch.setattr(build, "_P_AROUND", 0.75)
+    monkeypatch.setattr(tilting, "_P_INSIDE", 0.9)
+    monkeypatch.setattr(tilting, "_P_AROUND", 0.75)
     share = 0.8
     static = np.array([share, share, 0.999, 0.3, share], np.float32)  # of which two are in no box
     core = BoxBeams(np.array([0, 2]), np.array([True, True]))

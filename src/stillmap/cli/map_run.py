@@ -32,7 +32,7 @@ from stillmap.results.region import crop_result, require_overlap
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 
 class Inputs(NamedTuple):
@@ -79,7 +79,7 @@ def _read_tilting_laser(
     if planar.dimension != 2:
         what = "the planar laser decides which objects move, but this recording is 3D"
         raise InputError(what, where=args.input[0])
-    from stillmap.rig.build import check_rig  # only a rig needs it
+    from stillmap.pipeline.tilting import check_rig  # only a rig needs it
 
     paths = [part.path or "" for part in planar.source.parts] or args.input
 
@@ -205,7 +205,7 @@ def _map_tilting_laser(
     result: MappingResult, tilting: Recording, options: Options
 ) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
-    from stillmap.rig.build import PlanarResult, build_tilting, shift_tilting
+    from stillmap.pipeline.tilting import PlanarResult, build_tilting, shift_tilting
 
     near, threads = result.near, resolve_threads(options.threads)
     planar = PlanarResult(near.deskewed, near.poses, near.p_static, near.objects)

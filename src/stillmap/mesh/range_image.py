@@ -25,7 +25,7 @@ from stillmap.mesh.triangulation import (
     triangulate_grid,
     triangulate_strips,
 )
-from stillmap.rig.trajectory import MAX_SCAN_GAP
+from stillmap.slam.deskew import MAX_SCAN_GAP
 
 _MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole
 _SAMPLES = 2000  # beams by which row lengths are tested

@@ -7,10 +7,14 @@ import numpy as np
 
 from stillmap.em import GroundMap
 from stillmap.mesh.triangle_mesh import Bool, Float, Index
-from stillmap.rig.build import HOLD
-from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import Box, fit_box
+from stillmap.tracking.boxes import (
+    HOLD,
+    MAX_OBJECT_HEIGHT,
+    MIN_VEHICLE_LENGTH,
+    Box,
+    fit_box,
+)
 
 OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
 _OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin

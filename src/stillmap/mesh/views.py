@@ -14,8 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.triangle_mesh import Bool, Float, Image, Int64, Tell, no_tell
-from stillmap.rig.trajectory import MAX_SCAN_GAP
-from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
+from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED, MAX_TURN_RATE
 
 _MAX_IMAGE_EXTRAPOLATION = 0.1  # s before or after a scan where there is none on the other side
 _TRIED = 5  # images of a camera that are tried to find a readable one

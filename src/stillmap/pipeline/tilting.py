@@ -20,16 +20,15 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
-from stillmap.rig.removal import BoxBeams, select_box_beams
-from stillmap.rig.trajectory import PosedRecording, pose_recording
+from stillmap.pipeline.tilting_boxes import BoxBeams, select_box_beams
+from stillmap.pipeline.tilting_poses import PosedRecording, pose_recording
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import Box, fit_boxes
+from stillmap.tracking.boxes import HOLD, Box, fit_boxes
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
 from stillmap.tracking.objects_3d import MIN_POINTS
 
 Float = NDArray[np.float64]
 
-HOLD = 0.5  # s for which an object persists before its first and after its last detection
 _VOXEL = 0.1  # m, edge of the voxels of the occupancy evidence
 _MARGIN = 0.15  # m around the box of an object, where points are probably dynamic
 _P_INSIDE, _P_AROUND = 0.99, 0.9  # P(dynamic) of end points in a box and in its margin

@@ -10,14 +10,13 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em import GroundMap
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
-from stillmap.rig.trajectory import PosedRecording
-from stillmap.tracking.boxes import Box
+from stillmap.pipeline.tilting_poses import PosedRecording
+from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-MAX_OBJECT_HEIGHT = 2.0  # m above the ground
-MIN_VEHICLE_LENGTH, _MAX_VEHICLE_HEIGHT = 1.5, 4.0  # m; objects of this length may be higher
+_MAX_VEHICLE_HEIGHT = 4.0  # m above the ground
 _MAX_VERTICAL_GAP = 0.5  # m without any point, above which points belong to something else
 _MIN_HEIGHT = 1.0  # m; the planar laser lies lower, so points below in a box are of the object
 

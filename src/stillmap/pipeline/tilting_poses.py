@@ -7,13 +7,12 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording, beam_stamps_ns
-from stillmap.slam.deskew import MAX_SPEED
+from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
 
-MAX_SCAN_GAP = 1.0  # s between two scans over which the pose is unknown
 _BLOCK = 1 << 16  # beams per block
 
 

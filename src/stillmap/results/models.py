@@ -23,8 +23,8 @@ from stillmap.mesh.tracked_boxes import box_objects, extrude_boxes
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.views import View
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult, shift_tilting
 from stillmap.results.gltf import write_glb
-from stillmap.rig.build import TiltingResult, shift_tilting
 
 if TYPE_CHECKING:
     from stillmap.results.mapped_place import MappedPlace

@@ -14,7 +14,7 @@ from stillmap.results.points import Fields, coordinate_fields, ply_header
 from stillmap.tracking import FlowMap, MovingObject
 
 if TYPE_CHECKING:
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 # of the cloud of an object
 OBJECT_FIELDS: Fields = [(name, "<f4") for name in ("x", "y", "z", "seconds", "p_dynamic")]

@@ -23,7 +23,7 @@ from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 
 def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:

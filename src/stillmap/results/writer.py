@@ -26,7 +26,7 @@ from stillmap.results.run_json import models_record, run_record, tilting_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 
 def save(

@@ -19,6 +19,7 @@ Index = NDArray[np.intp]
 MAX_SPEED, MAX_TURN_RATE = 100.0, 12.0  # m/s, rad/s; faster steps are leaps, not motion
 # share of a scan's duration between two poses, at least: over less, their errors dominate
 _MIN_SPAN = 0.5
+MAX_SCAN_GAP = 1.0  # s between two scans over which the pose is unknown
 _BLOCK = 1 << 14  # beams per block
 
 

@@ -14,6 +14,9 @@ from stillmap.tracking.objects import HEADING_SPEED
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+HOLD = 0.5  # s for which an object persists before its first and after its last detection
+MAX_OBJECT_HEIGHT = 2.0  # m above the ground
+MIN_VEHICLE_LENGTH = 1.5  # m; objects of this length may be higher
 _MIN_POINTS = 2  # end points of a cluster without a track: fewer are noise
 _CLUSTER_HOLD = 0.1  # s for which the box of such a cluster persists
 

@@ -15,7 +15,7 @@ from stillmap.tracking import FlowMap, MovingObject
 from stillmap.tracking.objects import mean_speed, track_length
 
 if TYPE_CHECKING:
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 _MAX_TRACKS, _MAX_ROWS = 500, 25
 _PALETTE = 64  # colors of the traffic map

@@ -23,7 +23,7 @@ from stillmap.results.run_json import models_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 # files beside the report that are linked where they exist, with their content
 _FILES = {

@@ -13,7 +13,7 @@ from stillmap.results.colors import ORANGE, color_by_height
 from stillmap.results.report.figures import data_uri
 
 if TYPE_CHECKING:
-    from stillmap.rig.build import TiltingResult
+    from stillmap.pipeline.tilting import TiltingResult
 
 Float = NDArray[np.float64]
 Points = NDArray[np.float32]
