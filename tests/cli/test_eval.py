@@ -110,7 +110,7 @@ def test_relations(capsys, texts):
     assert s["translation"]["mean"] == pytest.approx(0.125)
     assert s["rotation"]["max"] == pytest.approx(0.0)
     assert main(["eval", "relations", str(texts.trajectory), str(texts.relations)]) == 0
-    assert "0.1250 +- 0.1768 m" in capsys.readouterr().out
+    assert "mean 0.125, std 0.176777" in capsys.readouterr().out
 
 
 def test_relations_with_odometry(capsys, texts, tmp_path):
@@ -157,7 +157,7 @@ def test_trajectory(capsys, simulated, result):
     s = scores(capsys, "trajectory", result / "trajectory.tum", reference, *frames)
     assert s["rpe"]["pairs"] == 57
     assert main(["eval", "trajectory", str(reference), str(reference)]) == 0
-    assert "rmse 0.0000 m" in capsys.readouterr().out
+    assert "rmse 0" in capsys.readouterr().out
 
 
 def test_trajectories_without_a_common_time(capsys, texts, tmp_path):
@@ -178,7 +178,7 @@ def test_labels(capsys, simulated, result):
     assert s["brier"] < 0.001
     assert s == scores(capsys, "labels", result, simulated / "truth")
     assert main(["eval", "labels", str(result), str(simulated)]) == 0
-    assert "F1 1.0000" in capsys.readouterr().out
+    assert "f1                      1" in capsys.readouterr().out
 
 
 def test_inverted_labels_score_badly(capsys, simulated, result):
@@ -197,7 +197,7 @@ def test_map(capsys, simulated, result):
     first = se2.parameters(np.load(simulated / "truth/T_world_base.npy")[0])
     assert s["T_world_map"] == pytest.approx(first.tolist(), abs=1e-6)
     assert main(["eval", "map", str(result), str(simulated)]) == 0
-    assert "walls kept   100.00 %" in capsys.readouterr().out
+    assert "walls kept              1" in capsys.readouterr().out
 
 
 def test_map_with_people_against_reference_map(capsys, simulated, result, tmp_path):

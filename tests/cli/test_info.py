@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -69,21 +70,24 @@ def test_json(path, capsys):
 def test_text(path, capsys):
     assert run(path) == 0
     out = capsys.readouterr().out
-    for part in (
-        "3 with 4 beams each",
-        "83.33 % hits, 8.33 % maximum range, 8.33 % unusable",
-        "-90.00 to 45.00 deg, 45 deg apart",
-        "81.83 m: SICK overflow values",
-        "zero means",
-        "100.000000000 to 102.000000000",
-        "path 5.00 m",
-        "x 0.250 m, y 0.000 m, turned 0.00 deg (PARAM)",
-        "robot_frontlaser_offset 0.25",
-        "1 line that cannot be read (line 4)",
-        "1 line that cannot be read (line 7)",
-        "warning",
-    ):
-        assert part in out, part
+    rows = {line[:22].strip(): line[24:] for line in out.splitlines()}
+    assert out.startswith(f"{path}: carmen, 2D\n")
+    for title, text in {
+        "scans": "3",
+        "beams per scan": "min 4, median 4, max 4",
+        "shares": "hits 0.833333, max range 0.0833333, unusable 0.0833333",
+        "hit ranges (m)": "min 1, median 2, p99 4, max 4",
+        "first stamp": "100.000000000 s",
+        "path length": "5 m",
+        "field of view": "-90, 45 deg",
+        "extrinsics": "x 0.25, y 0, theta 0 deg, how PARAM",
+        "robot_frontlaser_offset": "0.25",
+        "line that cannot be read": "count 1, lines 4",
+    }.items():
+        assert rows[title] == text, title
+    assert "81.83" in out
+    assert "SICK overflow values" in out
+    assert "warnings" in out
 
 
 def test_flags_reach_the_reader(path, capsys):
@@ -101,8 +105,8 @@ def test_upside_down_laser(path, capsys):
     assert "upside down" not in capsys.readouterr().out
     run(path, "--laser-upside-down", "--laser-fov", "90")
     out = capsys.readouterr().out
-    assert "beams turn clockwise (given)" in out
-    assert "-22.50 to 45.00 deg, 22.5 deg apart" in out
+    assert re.search(r"upside down +yes\n +upside down how +given", out)
+    assert "-22.5, 45 deg" in out
     run(path, "--json", "--laser-upside-down")
     (sensor,) = json.loads(capsys.readouterr().out)["sensors"]
     assert (sensor["upside_down"], sensor["upside_down_how"]) == (True, "given")
@@ -118,7 +122,7 @@ def test_recording_folder_gives_same_summary(path, tmp_path, capsys):
     assert folder.pop("input") == str(tmp_path / "rec")
     assert log == folder
     run(tmp_path / "rec")
-    assert f"made from         {path}" in capsys.readouterr().out
+    assert re.search(rf"made from +{path}", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +139,7 @@ def test_notes_of_other_writers(path, tmp_path, capsys, source):
     header = tmp_path / "rec/recording.json"
     header.write_text(json.dumps({**json.loads(header.read_text()), "source": source}))
     assert run(tmp_path / "rec") == 0
-    assert "-90.00 to 45.00 deg" in capsys.readouterr().out
+    assert "-90, 45 deg" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("scans", [0, 2])
@@ -154,7 +158,7 @@ def test_3d_recording(tmp_path, capsys, scans):
     assert run(tmp_path / "rec") == 0
     out = capsys.readouterr().out
     assert "3D" in out
-    assert ("max 5.00 m" in out) == (scans > 0)
+    assert ("max 5\n" in out) == (scans > 0)
     assert run(tmp_path / "rec", "--json") == 0
 
 
@@ -165,7 +169,7 @@ def test_beam_times(path, tmp_path, capsys):
     times = np.linspace(-0.05, 0.1, recording.n_beams).astype(np.float32)
     write(replace(recording, beam_time=times), tmp_path / "rec")
     assert run(tmp_path / "rec") == 0
-    assert "-0.05 to 0.1 s after a scan's stamp" in capsys.readouterr().out
+    assert "-0.05, 0.1 s" in capsys.readouterr().out
     assert run(tmp_path / "rec", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["beam_times_s"] == pytest.approx([-0.05, 0.1])
@@ -181,7 +185,7 @@ def test_poses_and_images(path, tmp_path, capsys):
     run(path)
     out = capsys.readouterr().out
     assert "recorded poses" not in out
-    assert "  camera" not in out
+    assert "cameras" not in out
     T = np.tile(np.eye(3), (3, 1, 1))
     T[:, 0, 2] = 0, 3, 7
     cameras = (
@@ -193,12 +197,10 @@ def test_poses_and_images(path, tmp_path, capsys):
     write(replace(recording, T_recorded_base=T, images=images), tmp_path / "rec")
     run(tmp_path / "rec")
     out = capsys.readouterr().out
-    assert "path 7.00 m, turned 0 deg: used with --poses recording" in out
-    assert "images            5" in out
-    assert "front, 3 of 8 x 6 pixels, calibrated and placed" in out
-    assert "rear, 2 of 80 x 60 pixels, uncalibrated" in out
-    assert "5, 0 of them usable" in out
-    assert "left out        5: of a 2D recording" in out
+    assert re.search("recorded poses +path length 7 m, turned 0 deg", out)
+    assert re.search("count +5\n +usable +0\n +left out +of a 2D recording 5", out)
+    assert re.search("name +front\n +count +3\n +usable +0\n +width +8\n", out)
+    assert re.search("name +rear\n(.*\n)+ +calibrated +no\n +placed +no", out)
     run(tmp_path / "rec", "--json")
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
@@ -236,14 +238,14 @@ def test_cameras_from_a_file(tmp_path, capsys):
         Image.new("RGB", (8, 6)).save(folder / "image_2" / f"{k}.png")
     (folder / "times.txt").write_text("0\n0.1\n")
     run(folder)
-    assert "2 of 8 x 6 pixels, uncalibrated" in capsys.readouterr().out
+    assert re.search("calibrated +no", capsys.readouterr().out)
     file = tmp_path / "cameras.toml"
     place = "translation = [0, 0, 1]\nrpy = [-1.57, 0, -1.57]\n"
     file.write_text(f"[image_2]\nfx = 9\nfy = 9\ncx = 3.5\ncy = 2.5\n{place}")
     run(folder, "--cameras", str(file))
     out = capsys.readouterr().out
-    assert "images            2, 2 of them usable" in out
-    assert "2 of 8 x 6 pixels, calibrated and placed" in out
+    assert re.search("count +2\n +usable +2", out)
+    assert re.search("calibrated +yes\n +placed +yes", out)
     file.write_text("[image_3]\n")
     with pytest.raises(InputError, match="nearest: 'image_2'"):
         run(folder, "--cameras", str(file))
@@ -254,4 +256,4 @@ def test_clouds_made_in_python(tmp_path, capsys):
     clouds = [np.ones((3, 3)), 2.0 * np.ones((2, 3))]
     write(Recording.from_clouds([0.0, 0.1], clouds), tmp_path / "clouds")
     assert run(tmp_path / "clouds") == 0
-    assert "2 with 2 (2 to 3) beams each, 5 beams" in capsys.readouterr().out
+    assert "min 2, median 2, max 3" in capsys.readouterr().out

@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType
@@ -14,6 +14,8 @@ from stillmap.core.errors import InputError, printable
 from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, is_terminal
 
+_UNITS = ("m", "s", "ns", "deg", "hz")  # at the end of keys
+_MAX_INLINE, _MAX_ITEMS = 80, 10  # characters of an object, items of a list, on one line
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
@@ -92,6 +94,63 @@ def show_tasks(quiet: bool) -> Iterator[Callable[[str, int, int, str], None]]:
 def print_lines(lines: Iterable[str]) -> None:
     """Print lines of text to stdout, control characters escaped."""
     print("\n".join(map(printable, lines)))
+
+
+def print_rows(content: Mapping[str, Any]) -> None:
+    """Print JSON values to stdout as text; see `format_rows`."""
+    print_lines(format_rows(content))
+
+
+def format_rows(content: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    """Yield a line for each entry of a JSON object, without empty ones.
+
+    Keys may end with a unit, as in `duration_s`; stamps in nanoseconds are shown in seconds. Short
+    objects are shown on one line, others entry by entry, indented.
+    """
+    for key, value in content.items():
+        title, unit = _split_unit(key)
+        is_table = isinstance(value, list) and any(isinstance(item, dict) for item in value)
+        for item in value if is_table else [value]:
+            if item in (None, "", [], {}):
+                continue
+            text = _format_value(item, unit)
+            if isinstance(item, dict) and unit:
+                title = f"{title} ({unit})"
+            if isinstance(item, dict) and len(text) > _MAX_INLINE:
+                yield f"{indent}{title}"
+                yield from format_rows(item, f"{indent}  ")
+            else:
+                yield f"{f'{indent}{title}':<22}  {text}"
+
+
+def _format_value(value: Any, unit: str = "") -> str:
+    if isinstance(value, dict):
+        entries = [(*_split_unit(key), item) for key, item in value.items()]
+        words = [
+            f"{title} {_format_value(item, of)}"
+            for title, of, item in entries
+            if item not in (None, "", [], {})
+        ]
+        return ", ".join(words)
+    if isinstance(value, list):
+        shown = [_format_value(item) for item in value[:_MAX_ITEMS]]
+        text = ", ".join([*shown, "..."] if len(value) > _MAX_ITEMS else shown)
+    elif unit == "ns" and isinstance(value, int):
+        from stillmap.core.timestamps import format_seconds  # NumPy takes long to load
+
+        text, unit = format_seconds(value), "s"
+    elif isinstance(value, bool):
+        text = "yes" if value else "no"
+    else:
+        text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{text} {unit}" if unit else text
+
+
+def _split_unit(key: str) -> tuple[str, str]:
+    """Words of a key, and the unit at its end."""
+    words = str(key).split("_")
+    unit = words.pop() if len(words) > 1 and words[-1] in _UNITS else ""
+    return " ".join(words), unit.replace("hz", "Hz")
 
 
 def print_json(content: dict[str, Any] | list[dict[str, Any]]) -> None:
