@@ -27,13 +27,18 @@ def examples(text: str) -> list[list[str]]:
 
 
 def test_examples_parse():
-    texts = [TOP.epilog, TOP.subcommands()["eval"].epilog, *(p.epilog for p in ALL.values())]
+    texts = [TOP.epilog, TOP.subcommands()["eval"].epilog, *(p.epilog or "" for p in ALL.values())]
     found = [words for text in texts for words in examples(text)]
     assert len(found) > 30
     for words in found:
         args = TOP.parse_args(words)
         assert callable(args.run)
     assert {words[0] for words in found} == set(COMMANDS)
+
+
+def test_every_help_can_be_shown():
+    for p in (TOP, *ALL.values()):
+        assert p.format_help().startswith("usage: stillmap")
 
 
 def test_every_scene_is_listed():

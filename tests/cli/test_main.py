@@ -8,32 +8,6 @@ import pytest
 
 from stillmap.cli.main import main
 
-COMMANDS = [
-    (),
-    ("map",),
-    ("info",),
-    ("simulate",),
-    ("config",),
-    ("eval",),
-    ("eval", "relations"),
-    ("eval", "trajectory"),
-    ("eval", "labels"),
-    ("eval", "map"),
-]
-
-
-@pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
-def test_help(names, capsys, monkeypatch):
-    from stillmap.cli.main import main
-
-    monkeypatch.setenv("COLUMNS", "100")
-    with pytest.raises(SystemExit) as left:
-        main([*names, "--help"])
-    assert left.value.code == 0
-    out, err = capsys.readouterr()
-    assert out.startswith("usage: stillmap")
-    assert err == ""
-
 
 def test_version(stillmap):
     import stillmap as package

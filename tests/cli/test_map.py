@@ -223,9 +223,3 @@ def test_poses_that_do_not_match_are_refused(call, room, tmp_path, nothing_left)
         refused(call("map", room, "-o", tmp_path / "out", "--poses", file), file, *said)
     refused(call("map", room, "-o", tmp_path / "out", "--poses", tmp_path / "absent"), "absent")
     nothing_left("poses.tum")
-
-
-def test_run_json_has_the_recording_path(call, room, tmp_path):
-    call("map", room, "-o", tmp_path / "out", *QUICK)
-    record = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert record["input"]["path"] == str(room)

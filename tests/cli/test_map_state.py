@@ -1,7 +1,6 @@
 """`stillmap map --map-state`: the state of changed places."""
 
 import json
-import subprocess
 
 import numpy as np
 import pytest
@@ -70,12 +69,6 @@ def test_states_differ_at_the_crate(mapped):
     np.testing.assert_array_equal(np.isnan(last), np.isnan(most))
 
 
-def test_flag_overrides_set(mapped):
-    words = ("--map-state", "majority", "--set", "output.map_state=last", "--map-mode", "scale")
-    chosen = mapped(*words)[2]["options"]["output"]
-    assert (chosen["map_mode"], chosen["map_state"]) == ("scale", "majority")
-
-
 @pytest.mark.parametrize("estimator", ["paper", "hit-ratio"])
 def test_other_estimators_have_no_changes(mapped, estimator):
     words = ("--estimator", estimator, "--set", "em.max_iterations=1")
@@ -93,29 +86,3 @@ def test_change_detection_off(mapped):
     assert "changing" not in told["learned"]
     assert "changing" in mapped()[2]["learned"]
     assert np.isfinite(p).any()
-
-
-def test_unknown_state_is_refused(stillmap, moved, tmp_path):
-    done: subprocess.CompletedProcess[str]
-    done = stillmap("map", moved, "-o", tmp_path / "out", "--map-state", "first")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "'last'" in done.stderr or "last" in done.stderr
-    assert "--map-state" in done.stderr
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("state", "shown"),
-    [("last", "in its last state"), ("majority", "in the state that it was in for longest")],
-)
-def test_number_of_changed_places_is_printed(moved, tmp_path, capsys, state, shown):
-    words = ["map", moved, "-o", tmp_path / "out", "--map-state", state]
-    words += ["--poses", moved / "truth/trajectory.tum"]
-    assert main([str(word) for word in words]) == 0
-    n = len(json.loads((tmp_path / "out/run.json").read_text())["changes"])
-    assert n >= 1
-    places = "1 place changed, the map shows it" if n == 1 else f"{n} places changed"
-    said = capsys.readouterr().err
-    assert places in said
-    assert shown in said

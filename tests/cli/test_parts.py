@@ -166,9 +166,7 @@ def test_an_interrupted_run_of_parts_continues(call, room, tmp_path, monkeypatch
     assert done.returncode == 0, done.stderr
     assert "continues after iteration 1" in done.stderr
     assert "3 parts of one run" in done.stderr
-    assert contents(tmp_path / "a").keys() == contents(tmp_path / "b").keys()
-    way, whole = (np.loadtxt(tmp_path / name / "trajectory.tum") for name in ("b", "a"))
-    np.testing.assert_allclose(way[:, 1:3], whole[:, 1:3], atol=0.03)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 def test_a_run_is_identified_by_all_its_parts(room, tmp_path):

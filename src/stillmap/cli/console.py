@@ -15,7 +15,7 @@ from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, is_terminal
 
 _UNITS = ("m", "s", "ns", "deg", "hz")  # at the end of keys
-_MAX_INLINE, _MAX_ITEMS = 80, 10  # characters of an object, items of a list, on one line
+_MAX_INLINE, _MAX_ITEMS = 100, 10  # characters of an object, items of a list, on one line
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
