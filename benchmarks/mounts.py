@@ -32,7 +32,7 @@ from common import (
 from tables import Column, Row, grouped, markdown
 
 from stillmap.core.config import merge_nested
-from stillmap.pipeline import result
+from stillmap.pipeline import calibration
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.slam.mount_calibration import Calibration
@@ -141,7 +141,7 @@ def mapped(run: Simulation, *, calibrated: bool) -> tuple[float, Scores]:
     if calibrated:
         made, cpu = built(run.recording, options)
     else:
-        with patch.object(result, "calibrate_recording", lambda r, _: (r, Calibration(), [])):
+        with patch.object(calibration, "calibrate_recording", lambda r, _: (r, Calibration(), [])):
             made, cpu = built(run.recording, options)
     found = made.calibration
     named = [one for of in (*found.lasers, found.odometry) for one in of.values()]

@@ -5,7 +5,9 @@ import tomllib
 
 import pytest
 
+from stillmap.cli.arguments import options_from_args
 from stillmap.cli.main import main
+from stillmap.cli.parser import parser
 from stillmap.core.config import to_dict
 from stillmap.pipeline.options import Options
 
@@ -70,6 +72,13 @@ def test_precedence(capsys, tmp_path, room):
         options = json.loads((out / "run.json").read_text())["options"]
         assert options["slam"]["resolution"] == wanted
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("words", ["map in", "merge in", "fleet in", "live"])
+def test_resolution_is_a_flag_of_all_that_map(words):
+    words = [*words.split(), "-o", "out", "--resolution", "0.2"]
+    slam = options_from_args(parser([words[0]]).parse_args(words)).slam
+    assert slam.resolution == slam.voxel_size == 0.2
 
 
 @pytest.mark.parametrize(

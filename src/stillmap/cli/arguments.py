@@ -38,13 +38,10 @@ _READ_FLAGS = {
     "--from": "read.start",
 }
 _END = "read.end"  # its flag is --to or --until: `convert --to` is a format
-_RUN_FLAGS = {"--threads": "threads"}
-_MAP_MODE = {"--map-mode": "output.map_mode"}
-_RESOLUTION = {"--resolution": "slam.resolution"}
+_PLACE_FLAGS = {"--resolution": "slam.resolution", "--map-mode": "output.map_mode"}
 _MAP_FLAGS = {
     "--mesh": "mesh.enabled",
-    **_RESOLUTION,
-    **_MAP_MODE,
+    **_PLACE_FLAGS,
     "--region": "output.region",
     "--map-state": "output.map_state",
 }
@@ -111,7 +108,7 @@ def add_run_flags(p: argparse.ArgumentParser) -> None:
     """Add the flags of how the command itself runs and what it prints."""
     from stillmap.pipeline.options import DEFAULTS
 
-    add_flags(p, _RUN_FLAGS, DEFAULTS)
+    add_flags(p, {"--threads": "threads"}, DEFAULTS)
     p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
@@ -137,18 +134,11 @@ def add_method_flags(p: argparse._ArgumentGroup) -> None:
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
 
 
-def add_map_mode_flag(p: argparse._ActionsContainer) -> None:
-    """Add the flag of how the map image is written."""
-    from stillmap.pipeline.options import DEFAULTS
-
-    add_flags(p, _MAP_MODE, DEFAULTS)
-
-
 def add_map_flags(p: argparse._ActionsContainer, *, whole: bool = True) -> None:
     """Add the flags of the map that is written; `whole`: all of them, not of a place alone."""
     from stillmap.pipeline.options import DEFAULTS
 
-    add_flags(p, _MAP_FLAGS if whole else _RESOLUTION | _MAP_MODE, DEFAULTS)
+    add_flags(p, _MAP_FLAGS if whole else _PLACE_FLAGS, DEFAULTS)
 
 
 def add_option_flags(p: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import (
-    add_map_mode_flag,
+    add_map_flags,
     add_option_flags,
     add_read_flags,
     add_run_flags,
@@ -68,13 +68,13 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     text = "disk, about, that the beams of the drive may take: beyond, poses go on, but no scan is "
     add("--max-scratch", "GB", text + "kept (default: all are)", type=float)
     add("--no-odometry", None, "ignore odometry in the recording")
-    add("--resolution", "M", "edge of a map cell in metres (default: 0.05)", type=float)
     text = "serve map, scans, pose and path to Foxglove or Lichtblick on this machine, over a "
     add("--foxglove", None, text + "WebSocket; needs the extra `live`")
     text = "where --foxglove listens; who reaches it can watch (default: 127.0.0.1)"
     add("--host", "ADDRESS", text)
     add("--port", "N", "port of --foxglove; 0: a free one (default: 8765)", type=int)
-    for add_more in (add_map_mode_flag, add_run_flags, add_read_flags, add_option_flags):
+    add_map_flags(p, whole=False)
+    for add_more in (add_run_flags, add_read_flags, add_option_flags):
         add_more(p)
     text = "of the node, up to the end"
     p.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], help=text)

@@ -1,7 +1,6 @@
 """`stillmap map`: parse, read, build, save."""
 
 import argparse
-import os
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -99,18 +98,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
-    """Refuse an output that is taken, holds an input or cannot be written, before any work."""
-    from stillmap.core.files import require_new, workplace
+    """Refuse an output that is taken or holds an input, before any work."""
+    from stillmap.core.files import require_new
     from stillmap.results.reader import RECORD
 
     require_new(output, RECORD, args.overwrite or args.resume)
     for source in filter(None, (*args.input, args.tilting)):
         require_apart(output, Path(source))
-    parent = workplace(output)
-    while not parent.exists():
-        parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise InputError(f"cannot be written: {parent} is not writable", where=str(output))
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """`stillmap merge`: sessions of one place into one map with dated changes."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from stillmap.cli.console import list_files, print_json, say, show_progress
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stillmap.pipeline.options import Options
     from stillmap.places.finish import PlaceResult
     from stillmap.places.merge import MergeJob
 
@@ -74,34 +72,22 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: an input or the output is at fault, or fewer than two sessions could be placed.
     """
-    from stillmap.results.reader import is_place
+    from stillmap.core.files import require_new
+    from stillmap.places.inputs import list_sessions
+    from stillmap.places.merge import MergeJob, merge_sessions
+    from stillmap.results.reader import RECORD, is_place
+    from stillmap.results.timeline import read_sessions
 
-    options = options_from_args(args)
+    options, output = options_from_args(args), Path(args.output)
     base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
     paths = args.input if base is None else args.input[1:]
     if not paths:
         raise InputError("names no session to add", where=args.input[0])
-    return _merge(args, base, [[path] for path in paths], options)
-
-
-def _merge(
-    args: argparse.Namespace,
-    base: Path | None,
-    groups: Sequence[Sequence[str]],
-    options: "Options",
-) -> int:
-    from stillmap.core.files import require_new
-    from stillmap.places.inputs import list_sessions
-    from stillmap.places.merge import MergeJob, merge_sessions
-    from stillmap.results.reader import RECORD
-    from stillmap.results.timeline import read_sessions
-
-    output = Path(args.output)
     require_new(output, RECORD, args.overwrite)
-    for path in [*([] if base is None else [base]), *(Path(p) for group in groups for p in group)]:
-        require_apart(output, path)
-    taken = [] if base is None else [one.name for one in read_sessions(base)]
-    sessions = list_sessions(groups, taken)
+    for path in args.input:
+        require_apart(output, Path(path))
+    taken = [] if base is None else [session.name for session in read_sessions(base)]
+    sessions = list_sessions([[path] for path in paths], taken)
     job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
     with (
         make_parents(output),

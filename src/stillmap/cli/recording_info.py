@@ -1,6 +1,5 @@
 """Summary statistics of a recording, for `stillmap info`."""
 
-from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -13,7 +12,6 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
 
 _MAX_SAMPLE = 1 << 24  # beams used for quantiles of ranges
-_MIN_SCANS = 100  # scans that a sample needs
 _TABLES = ("skipped", "skipped_odometry", "damage", "records", "ignored", "params", "read_options")
 _LISTS = ("duplicates", "warnings", "topics", "self_filter")
 _WORDS = ("path", "format", "base_frame", "base_frame_how")
@@ -50,25 +48,14 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
 
 
 def _sample_hit_ranges(recording: Recording) -> NDArray[np.float32]:
-    """Ranges of the hits, m; a regular sample of them in huge recordings."""
-    step = -(-recording.n_beams // _MAX_SAMPLE)
-    parts = [np.empty(0, np.float32)]
-    for beams in (
-        arrays.iter_blocks(recording.points, recording.hit)
-        if step <= 1
-        else _iter_sample(recording, step)
-    ):
-        points = recording.points[beams][recording.hit[beams]]
+    """Ranges of the hits, m; of a sample of them in huge recordings."""
+    sample, parts = arrays.sample_indices(recording.n_beams, _MAX_SAMPLE), [np.empty(0, "f4")]
+    for part in arrays.split_by_block(sample, arrays.BLOCK):
+        beams = sample[part]
+        points = recording.points[beams[recording.hit[beams]]]
         parts.append(np.linalg.norm(points.astype(np.float64), axis=1).astype(np.float32))
+        recording.release_pages()
     return np.concatenate(parts)
-
-
-def _iter_sample(recording: Recording, step: int) -> Iterator[slice]:
-    """Slices of every `step`-th scan, or of every `step`-th beam where scans are few."""
-    every = step if recording.n_scans >= _MIN_SCANS * step else 1
-    for scan in recording.iter_scans(range(0, recording.n_scans, every)):
-        beams = recording.beams_of(scan)
-        yield slice(beams.start, beams.stop, step // every)
 
 
 def _quantiles(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] | None:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.core import se2
@@ -13,7 +15,13 @@ from stillmap.core.source import SensorNotes
 from stillmap.pipeline.options import Options
 from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.lasers import mirror_beams
-from stillmap.prepare.plausibility import interpolate_late_odometry
+from stillmap.prepare.plausibility import (
+    interpolate_late_odometry,
+    leave_out_far_returns,
+    leave_out_far_scans,
+    remove_leaps,
+    stated_max_range,
+)
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
 from stillmap.slam.mount_calibration import (
     LATENCY,
@@ -26,6 +34,43 @@ from stillmap.slam.mount_calibration import (
     refine_positions,
 )
 from stillmap.slam.spin_estimation import estimate_spin
+
+
+class CorrectedRecording(NamedTuple):
+    """A recording as it is mapped.
+
+    Attributes:
+        recording: without impossible readings, with beam times, mounts and odometry as found.
+        options: with what was found in place of `auto`.
+        calibration: of mounts and odometry; empty with given poses.
+        notes: a sentence for everything that was changed.
+    """
+
+    recording: Recording
+    options: Options
+    calibration: Calibration
+    notes: list[str]
+
+
+def correct_recording(
+    recording: Recording, options: Options, poses: NDArray[np.float64] | None
+) -> CorrectedRecording:
+    """Leave out what cannot be, time sweeps, and calibrate; poses (T, D+1, D+1): those to keep."""
+    cell = options.slam.resolution
+    recording, notes = remove_leaps(recording)
+    if poses is not None:
+        recording, more = leave_out_far_scans(recording, poses, cell)
+        notes += more
+    max_range = options.read.max_range or stated_max_range(recording)
+    recording, more = leave_out_far_returns(recording, cell, max_range)
+    notes += more
+    recording, options, more = time_sweeps(recording, options)
+    notes += more
+    calibration = Calibration()
+    if poses is None:
+        recording, calibration, more = calibrate_recording(recording, options)
+        notes += more
+    return CorrectedRecording(recording, options, calibration, notes)
 
 
 def calibrate_recording(

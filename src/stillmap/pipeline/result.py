@@ -17,7 +17,7 @@ from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping import Change, Door
-from stillmap.pipeline.calibration import calibrate_recording, time_sweeps
+from stillmap.pipeline.calibration import correct_recording
 from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
@@ -37,12 +37,6 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
-from stillmap.prepare.plausibility import (
-    leave_out_far_returns,
-    leave_out_far_scans,
-    remove_leaps,
-    stated_max_range,
-)
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
@@ -189,21 +183,8 @@ def map_recording(
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
     frame, odometry, recording, poses = enter_local_frame(recording, poses)
-    found = Calibration()
     with stages.measure("calibration"):
-        cell = options.slam.resolution
-        recording, notes = remove_leaps(recording)
-        if poses is not None:
-            recording, more = leave_out_far_scans(recording, poses, cell)
-            notes += more
-        max_range = options.read.max_range or stated_max_range(recording)
-        recording, more = leave_out_far_returns(recording, cell, max_range)
-        notes += more
-        recording, options, more = time_sweeps(recording, options)
-        notes += more
-        if poses is None:
-            recording, found, more = calibrate_recording(recording, options)
-            notes += more
+        recording, options, calibration, notes = correct_recording(recording, options, poses)
     state = resume or EmState(options)
     state.options = options  # a checkpoint has those from before the direction of spin was found
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
@@ -220,7 +201,9 @@ def map_recording(
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
     recording = restore_odometry(recording, odometry)
-    result = dataclasses.replace(result, recording=recording, calibration=found, warnings=warnings)
+    result = dataclasses.replace(
+        result, recording=recording, calibration=calibration, warnings=warnings
+    )
     return _to_map_frame(result, frame)
 
 
