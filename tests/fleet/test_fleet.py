@@ -9,7 +9,7 @@ import pytest
 
 from stillmap.fleet.inputs import Source
 from stillmap.fleet.jobs import Fleet, Job, Outcome, Place
-from stillmap.fleet.page import render_page
+from stillmap.fleet.run import render_page
 
 
 @pytest.fixture

@@ -61,52 +61,40 @@ def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:
 def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tuple[list[str], str]:
     """Write a result for other programs; return what was lost, and what was written."""
     from stillmap.results.export import point_cloud_files
-    from stillmap.results.folder import open_result
-    from stillmap.results.reader import is_place
+    from stillmap.results.folder import ResultFolder, open_result
+    from stillmap.results.reader import is_place, read_run
 
     if flag_changes(args):
         text = "a result's recording is read as it was for the map: no flags for reading it"
         raise InputError(text, where=str(source))
-    if is_place(source):
-        return _convert_place(args, source, output)
-    result = open_result(source, args.recording)
-    for path in result.sources:
+    is_whole = is_place(source)  # what a place has as a whole needs none of its recordings
+    if is_whole:
+        result = ResultFolder(source, read_run(source))
+    else:
+        result = open_result(source, args.recording)
+    for path in result.sources or (source,):
         require_apart(output, path, source)
     if args.to == NAV2 or given_zone_flags(args):
         return _convert_to_nav2(args, result, output)
-    if (form := point_cloud_files.format_for(output, args.to)) is not None:
+    form = point_cloud_files.format_for(output, args.to)
+    if form is not None and (result.dimension == 3 or not is_whole):
         return [], _convert_to_cloud(args, result, output, form)
+    if is_whole:
+        raise _only_for_sessions(result)
     if args.only:
         hint = ", ".join(CLOUDS)
         raise InputError("--only is for clouds of points", where=str(output), hint=hint)
-    ending = output.suffix.lower() if args.to is None else None
-    if ending == _PARQUET:
+    if args.to is None and output.suffix.lower() == _PARQUET:
         return [], _convert_to_table(args, result, output)
     return _convert_to_bag(args, result, output)
 
 
-def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple[list[str], str]:
-    """Write what a place has as a whole, which needs none of its recordings.
-
-    Raises:
-        InputError: another format is wanted.
-    """
-    from stillmap.results.export import point_cloud_files
-    from stillmap.results.folder import ResultFolder
-    from stillmap.results.reader import read_run
-
-    require_apart(output, place)
-    result = ResultFolder(place, read_run(place))
-    if args.to == NAV2 or given_zone_flags(args):
-        return _convert_to_nav2(args, result, output)
-    form = point_cloud_files.format_for(output, args.to)
-    if form is not None and result.dimension == 3:
-        return [], _convert_to_cloud(args, result, output, form)
+def _only_for_sessions(place: "ResultFolder") -> InputError:
     what = f"is a place of several recordings: it becomes maps and masks (--to {NAV2})"
-    if result.dimension == 3:
+    if place.dimension == 3:
         what += f" or a cloud ({', '.join(CLOUDS)})"
-    hint = f"session by session: stillmap convert {place}/sessions/NAME -o FILE"
-    raise InputError(what, where=str(place), hint=hint)
+    hint = f"session by session: stillmap convert {place.folder}/sessions/NAME -o FILE"
+    return InputError(what, where=str(place.folder), hint=hint)
 
 
 def _convert_to_nav2(
@@ -164,11 +152,6 @@ def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: 
     return f"{exported.recording.n_beams} beams"
 
 
-def _describe(exported: "MappedPlace") -> str:
-    scans, objects = exported.recording.n_scans, len(exported.objects)
-    return f"{scans} scans, map, trajectory and {objects} objects"
-
-
 def _convert_to_bag(
     args: argparse.Namespace, result: "ResultFolder", output: Path
 ) -> tuple[list[str], str]:
@@ -190,7 +173,8 @@ def _convert_to_bag(
     exported = _read_result(args, result, output)
     with show_share(args.quiet, "writing") as progress:
         losses = bag.write(exported, output, kind, overwrite=args.overwrite, progress=progress)
-    return losses, _describe(exported)
+    scans, objects = exported.recording.n_scans, len(exported.objects)
+    return losses, f"{scans} scans, map, trajectory and {objects} objects"
 
 
 def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "MappedPlace":
@@ -227,7 +211,6 @@ def _build_cloud(
     args: argparse.Namespace, result: "ResultFolder", scratch: Path
 ) -> "point_cloud.Cloud":
     from stillmap.core.grid_map import limit_hits
-    from stillmap.io.trajectory import poses_from_tum
     from stillmap.results import point_cloud
     from stillmap.results.reader import read_colors
     from stillmap.slam import deskew_recording
@@ -240,7 +223,7 @@ def _build_cloud(
             where=str(result.folder),
             hint=f"{_PARQUET} holds the end points of its beams",
         )
-    poses = poses_from_tum(result.folder / "trajectory.tum", recording)
+    poses = result.read_poses(recording)
     deskewed = deskew_recording(recording, poses, result.slam_options)
     colors = read_colors(result.folder, recording.n_beams)
     deskewed = limit_hits(deskewed, poses, result.region)

@@ -168,11 +168,10 @@ def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beam
 
 
 def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
-    from stillmap.io.trajectory import poses_from_tum
     from stillmap.results.viewer.beams import Beams
 
     with show_share(quiet, "reading") as progress:
         recording, labels = result.read(progress)
     recording = result.calibrate(recording)
-    poses = poses_from_tum(result.folder / "trajectory.tum", recording)
+    poses = result.read_poses(recording)
     return Beams(recording, labels.p_static, poses, result.slam_options)

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -179,37 +179,38 @@ def _inside(fs: Any, path: str, is_pattern: bool) -> list[str]:
     local = "file" in fs.protocol
     url = path if local else str(fs.unstrip_protocol(path))
     if not fs.isdir(path):
-        is_candidate = _is_candidate if local else _is_named_like_one
-        return [url] if not is_pattern or is_candidate(Path(path)) else []
+        return [url] if not is_pattern or _is_candidate(Path(path), local) else []
     if local:
-        names = _recordings_in(Path(path), _is_candidate)
+        names = _recordings_in(Path(path), local)
     else:
         with TemporaryDirectory(prefix="stillmap-") as scratch:
             for name in list_files(url):  # the formats of folders are recognised by names alone
                 (Path(scratch) / name).parent.mkdir(parents=True, exist_ok=True)
                 (Path(scratch) / name).touch()
-            names = _recordings_in(Path(scratch), _is_named_like_one)
+            names = _recordings_in(Path(scratch), local)
     return [f"{url}/{name}" if name else url for name in names]
 
 
-def _recordings_in(folder: Path, is_candidate: Callable[[Path], bool]) -> list[str]:
+def _recordings_in(folder: Path, has_content: bool) -> list[str]:
     """Names of the recordings in a folder; an empty one: it is a recording itself."""
-    if is_candidate(folder):
+    if _is_candidate(folder, has_content):
         return [""]
-    inside = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path.name for path in inside if is_component(path.name) and is_candidate(path))
+    inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    inside = [path for path in inside if is_component(path.name)]
+    return sorted(path.name for path in inside if _is_candidate(path, has_content))
 
 
-def _is_candidate(path: Path) -> bool:
-    """Whether an entry of a folder is to be mapped; damaged files are, to be reported."""
+def _is_candidate(path: Path, has_content: bool) -> bool:
+    """True if an entry of a folder is to be mapped; damaged files are, to be reported.
+
+    Args:
+        path: a file or folder.
+        has_content: else the names, of the file or in the folder, are all that is known.
+    """
     if path.is_dir():
-        return is_recording(path) and not (path / "run.json").is_file()  # clouds of a result
-    return path.name.lower().endswith(_SURE_ENDINGS) or is_recording(path)
-
-
-def _is_named_like_one(path: Path) -> bool:
-    """Whether an empty file or folder has the name, or the inside, of a recording."""
-    if path.is_dir():
-        matches = any(known.matches(path, None) for known in FORMATS)
-        return matches and not (path / "run.json").is_file()
-    return path.name.lower().endswith((*_SURE_ENDINGS, *_USUAL_ENDINGS))
+        matches = (known.matches(path, None) for known in FORMATS)
+        is_known = is_recording(path) if has_content else any(matches)
+        return is_known and not (path / "run.json").is_file()  # clouds of a result
+    if path.name.lower().endswith(_SURE_ENDINGS):
+        return True
+    return is_recording(path) if has_content else path.name.lower().endswith(_USUAL_ENDINGS)

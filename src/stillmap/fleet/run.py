@@ -16,8 +16,8 @@ from stillmap.core.json import to_json
 from stillmap.fleet.inputs import Source, find_sources
 from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
 from stillmap.fleet.locations import absolute, explain, is_folder_name, is_local, open_location
-from stillmap.fleet.page import render_page
 from stillmap.fleet.tasks import STAGING, Task, read_made, run_task
+from stillmap.results.report import template
 
 LIST, PAGE = "fleet.json", "fleet.html"
 _LOCK = ".lock"
@@ -252,3 +252,23 @@ def _write(root: str, name: str, text: str) -> None:
         return
     with explain(f"{root}/{name}", "written"):
         fs.pipe_file(f"{path}/{name}", text.encode())
+
+
+def render_page(fleet: Fleet) -> str:
+    """`fleet.html`: no outside request, no script; links lead to the reports beside it."""
+    return template.render_page({"fleet": fleet, "totals": _totals(fleet)}, "fleet.html.j2")
+
+
+def _totals(fleet: Fleet) -> dict[str, Any]:
+    done = [job.outcome for job in fleet.jobs if job.outcome.is_done]
+    seconds = sum(outcome.summary.get("duration_s") or 0.0 for outcome in done)
+    cpu = sum(outcome.cpu_seconds for outcome in done)
+    return {
+        "recordings": len(fleet.jobs),
+        "done": len(done),
+        "duration": seconds,
+        "bytes": sum(outcome.summary.get("bytes") or 0 for outcome in done),
+        "cpu": cpu,
+        "cpu_per_hour": cpu / seconds * 3600 if seconds else None,
+        "memory": max((outcome.peak_memory_bytes for outcome in done), default=0),
+    }
