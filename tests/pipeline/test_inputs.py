@@ -130,13 +130,6 @@ def test_a_leap_of_the_odometry_is_reported(room, leap, said):
     assert not any(said[:20] in warning for warning in plain)
 
 
-def test_missing_odometry_is_reported(short):
-    with_it = stillmap.build(short.recording, options(max_iterations=1))
-    without = stillmap.build(short.recording.without_odometry(), options(max_iterations=1))
-    assert not any("no odometry" in warning for warning in with_it.warnings)
-    assert any("no odometry" in warning for warning in without.warnings)
-
-
 def _transform(dimension, x=0.0, rotation=1.0):
     T = np.eye(dimension + 1)
     T[0, dimension] = x

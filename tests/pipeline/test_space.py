@@ -193,15 +193,6 @@ def test_labels_in_space_are_scored_and_plans_are_not(street, mapped, tmp_path, 
     assert "is not a planar recording" in capsys.readouterr().err
 
 
-def test_other_estimators_of_the_plane_are_refused(street):
-    with pytest.raises(stillmap.InputError, match="for 2D recordings"):
-        stillmap.build(
-            street.recording,
-            options(estimator="tracker"),
-            poses=street.truth.T_world_base,
-        )
-
-
 @pytest.mark.slow
 def test_the_printed_method_runs_in_3d():
     lidar = {"channels": 16, "columns": 300, "sweep": False}

@@ -115,18 +115,6 @@ def test_tracking_is_done_twice_and_the_second_time_counts(build):
     assert (asked, once.converged) == (1, False)
 
 
-def test_the_history_tells_every_iteration_and_not_only_the_best(build):
-    result, _ = build([-5.0, -3.0, -4.0], options())
-    M = result.recording.n_beams
-    assert [it.number for it in result.iterations] == [1, 2, 3]
-    assert [it.bound for it in result.iterations] == [-5.0 * M, -3.0 * M, -4.0 * M]
-    assert [it.expected_log_likelihood for it in result.iterations] == [
-        bound * M - 1.0 for bound in (-5.0, -3.0, -4.0)
-    ]
-    assert [it.changed_share for it in result.iterations] == [0.5, 0.25, 0.5 / 3]
-    assert [it.seconds for it in result.iterations] == [1.0, 2.0, 3.0]
-
-
 def test_the_held_out_score_decides(build):
     held_out = [1.0, 1.2, 1.1]
     result, _ = build([-3.0, -4.0, -2.0], options(), held_out_log_likelihood=held_out)
@@ -179,12 +167,6 @@ def test_patience_ends_it(build):
     result, asked = build([-3.0, -4.0, -5.0, -6.0, -1.0], options(patience=2))
     assert (asked, result.converged) == (3, True)
     assert_kept(result, 1)
-
-
-def test_the_limit_ends_it_unconverged(build):
-    result, asked = build([-9.0, -8.0, -7.0, -6.0], options(max_iterations=3))
-    assert (asked, result.converged) == (3, False)
-    assert len(result.iterations) == 3
 
 
 @pytest.mark.parametrize("bounds", [[-5.0, -3.0, -4.0, -2.0, -2.5], [-3.0, -4.0, -5.0], [-5.0]])
