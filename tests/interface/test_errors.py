@@ -1,72 +1,15 @@
 """Errors of the package in the terms of Python, of the command line in those of the shell."""
 
-import ast
 import dataclasses
 import os
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import stillmap
-from stillmap.cli.console import _IN_HINTS as FLAGS
 from stillmap.cli.main import main
-from stillmap.cli.parser import COMMANDS, parser
-
-PACKAGE = Path(stillmap.__file__).parent
-COMMAND_LINES = PACKAGE / "fleet" / "tasks.py"  # of what workers run
-LIBRARY = [
-    path for path in PACKAGE.rglob("*.py") if path.parent.name != "cli" and path != COMMAND_LINES
-]
-
-
-# a drive is kept by the commands alone, and this one saves it later
-COMMANDS_TOLD = {("live/last_save.py", "--drive")}
-
-
-def texts(path):
-    """The strings of a module but for its docstrings."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    docstrings = {
-        id(node.body[0].value)
-        for node in ast.walk(tree)
-        if isinstance(node, documented) and node.body and isinstance(node.body[0], ast.Expr)
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and id(node) not in docstrings:
-            yield str(node.value)
-
-
-def test_the_library_names_no_flags():
-    named = [
-        f"{path.relative_to(PACKAGE)}: {text}"
-        for path in LIBRARY
-        for text in texts(path)
-        if re.search(r"(?<![\w-])--[a-z]", text)
-        if (path.relative_to(PACKAGE).as_posix(), text) not in COMMANDS_TOLD
-    ]
-    assert named == []
-    assert len(LIBRARY) > 100
-
-
-def test_every_argument_that_has_a_flag_is_named_in_a_hint():
-    everything = "\n".join(text for path in LIBRARY for text in texts(path))
-    known = {flag for name in COMMANDS for flag in all_flags(parser([name]))}
-    for argument, flag in FLAGS.items():
-        assert argument in everything, argument
-        assert set(re.findall(r"--[\w-]+", flag)) <= known, flag
-
-
-def all_flags(one):
-    """Flags of a command and of those below it."""
-    yield from one._option_string_actions
-    if one._subparsers:
-        for inner in one._subparsers._group_actions[0].choices.values():
-            yield from all_flags(inner)
 
 
 def calls(built, folder, saved, tmp_path):
