@@ -15,7 +15,7 @@ from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, is_terminal
 
 _UNITS = ("m", "s", "ns", "deg", "hz")  # at the end of keys
-_MAX_INLINE, _MAX_ITEMS = 100, 10  # characters of an object, items of a list, on one line
+_MAX_INLINE, _MAX_ITEMS = 96, 10  # characters of an object, items of a list, on one line
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
@@ -113,14 +113,14 @@ def format_rows(content: Mapping[str, Any], indent: str = "") -> Iterator[str]:
         for item in value if is_table else [value]:
             if item in (None, "", [], {}):
                 continue
-            text = _format_value(item, unit)
-            if isinstance(item, dict) and unit:
-                title = f"{title} ({unit})"
-            if isinstance(item, dict) and len(text) > _MAX_INLINE:
-                yield f"{indent}{title}"
-                yield from format_rows(item, f"{indent}  ")
+            text, inner = _format_value(item, unit), item if isinstance(item, dict) else {}
+            shown = f"{indent}{title} ({unit})" if inner and unit else f"{indent}{title}"
+            is_nested = any(isinstance(value, dict) for value in inner.values())
+            if is_nested or (inner and len(text) > _MAX_INLINE):
+                yield shown
+                yield from format_rows(inner, f"{indent}  ")
             else:
-                yield f"{f'{indent}{title}':<22}  {text}"
+                yield f"{shown:<22}  {text}"
 
 
 def _format_value(value: Any, unit: str = "") -> str:
