@@ -101,6 +101,18 @@ def test_repeated_interruptions(call, room, tmp_path, stop_after, whole):
     assert contents(tmp_path / "out") == contents(whole)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["paper", "tracker", "hit-ratio"])
+def test_other_estimators(call, room, tmp_path, stop_after, estimator):
+    words = ("--estimator", estimator, *WORDS)
+    assert call("map", room, "-o", tmp_path / "whole", *words).returncode == 0
+    stop_after(1)
+    call("map", room, "-o", tmp_path / "out", *words)
+    stop_after(ALL)
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
 def test_given_poses(call, room, tmp_path, stop_after):
     words = ("--poses", room / "truth/trajectory.tum", *WORDS)
     stop_after(1)
@@ -174,7 +186,7 @@ def test_resume_with_other_threads(call, room, tmp_path, interrupted, whole):
 
 
 @pytest.mark.parametrize(
-    "name", ["checkpoint.json", "state.latest.m_step.poses.npy", "state.best.e_step.p_static.npy"]
+    "name", ["checkpoint.json", "state.best.m_step.poses.npy", "state.best.e_step.p_static.npy"]
 )
 def test_damaged_checkpoint_is_named(call, room, tmp_path, interrupted, name):
     path = interrupted / "iteration-2" / name

@@ -168,7 +168,7 @@ def checkpoint(interrupted, tmp_path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "name", ["checkpoint.json", "state.best.m_step.poses.npy", "state.latest.e_step.p_static.npy"]
+    "name", ["checkpoint.json", "state.best.m_step.poses.npy", "state.best.e_step.p_static.npy"]
 )
 @pytest.mark.parametrize(
     "fault",
@@ -212,9 +212,9 @@ def test_record_that_no_run_has_written(checkpoint, tmp_path, capsys, change):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("state.latest.m_step.poses", lambda a: a[:-1]),
-        ("state.latest.m_step.poses", lambda a: np.full_like(a, np.nan)),
-        ("state.latest.m_step.poses", lambda a: 1e300 * a),
+        ("state.best.m_step.poses", lambda a: a[:-1]),
+        ("state.best.m_step.poses", lambda a: np.full_like(a, np.nan)),
+        ("state.best.m_step.poses", lambda a: 1e300 * a),
         ("state.best.e_step.p_static", lambda a: a[:-1]),
         ("state.best.e_step.p_static", lambda a: a - 2),
         ("state.best.e_step.p_static", lambda a: a.astype("U4")),

@@ -152,6 +152,7 @@ def _pack(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """A tree of dataclasses as JSON values; its large arrays go into `arrays` by name."""
     if isinstance(value, np.ndarray):
         if value.size > _INLINE:
+            name = next((known for known, array in arrays.items() if array is value), name)
             arrays[name] = value
             return {_FILE: name}
         return {_ARRAY: [value.dtype.str, value.shape, _pack(value.ravel().tolist(), name, arrays)]}
