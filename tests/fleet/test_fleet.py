@@ -221,7 +221,7 @@ def test_folder_that_cannot_be_written(stand_in, logs, tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr("stillmap.core.input_files.open_lock", refuse)
+    monkeypatch.setattr("stillmap.fleet.run.hold_lock", refuse)
     done = stand_in(logs(a="fine"), "-o", tmp_path / "out")
     assert done.returncode == 2
     assert done.stderr == f"stillmap: {tmp_path / 'out'}: cannot be written: Permission denied\n"
