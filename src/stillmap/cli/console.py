@@ -15,6 +15,7 @@ from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, is_terminal
 
 _UNITS = ("m", "s", "ns", "deg", "hz")  # at the end of keys
+_EMPTY: tuple[Any, ...] = (None, "", [], {}, ())
 _MAX_INLINE, _MAX_ITEMS = 96, 10  # characters of an object, items of a list, on one line
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
@@ -109,9 +110,9 @@ def format_rows(content: Mapping[str, Any], indent: str = "") -> Iterator[str]:
     """
     for key, value in content.items():
         title, unit = _split_unit(key)
-        is_table = isinstance(value, list) and any(isinstance(item, dict) for item in value)
+        is_table = isinstance(value, list | tuple) and any(isinstance(item, dict) for item in value)
         for item in value if is_table else [value]:
-            if item in (None, "", [], {}):
+            if item in _EMPTY:
                 continue
             text, inner = _format_value(item, unit), item if isinstance(item, dict) else {}
             shown = f"{indent}{title} ({unit})" if inner and unit else f"{indent}{title}"
@@ -129,10 +130,10 @@ def _format_value(value: Any, unit: str = "") -> str:
         words = [
             f"{title} {_format_value(item, of)}"
             for title, of, item in entries
-            if item not in (None, "", [], {})
+            if item not in _EMPTY
         ]
         return ", ".join(words)
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         shown = [_format_value(item) for item in value[:_MAX_ITEMS]]
         text = ", ".join([*shown, "..."] if len(value) > _MAX_ITEMS else shown)
     elif unit == "ns" and isinstance(value, int):
