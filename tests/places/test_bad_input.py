@@ -41,7 +41,7 @@ def dump(array: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-# written anew by every merge, so that nobody needs to read them; clouds are read when they are moved
+# written anew by every merge: nobody needs to read them; clouds are read when they are moved
 OUTPUTS = ("trajectory.tum", "beams/p_static.npy", "objects/", "state/objects/")
 
 
