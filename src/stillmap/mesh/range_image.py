@@ -10,7 +10,6 @@ The neighborhood of beams is derived from their directions, whatever format they
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -37,8 +36,6 @@ _FLATNESS = 0.04  # rad from a plane: a planar laser may sit off its joint
 _MIN_SPREAD = 0.2  # rad within the plane
 _TESTED_SCANS = 9  # that tell whether scans are planar
 _ROWS_PER_PATCH = 128  # planar scans triangulated together
-_MIN_ROW_STEP = 0.2  # of the median angle between rows: nearer ones are the same row
-_MAX_ROW_STEP = 4.0  # times that angle: farther ones are no neighbors
 
 
 class Patch(NamedTuple):
@@ -65,7 +62,7 @@ class ScanLayout(NamedTuple):
     Attributes:
         is_planar: whether each scan is a row.
         groups: scans of each range image.
-        stride: every how many-th row and column is used.
+        stride: every how many-th row and column is used, but for planar scans.
     """
 
     is_planar: bool
@@ -210,13 +207,13 @@ def _make_patch(
     if layout.is_planar:
         R = recording.T_base_sensor[sensor, :3, :3]
         directions = np.einsum("nij,nj->ni", R[scan], directions)
-        number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
-        faces = _triangulate_rows(points, use, number, directions)
+        row_length = len(beam) // len(scans)
     else:
         key = (int(sensor[0]), len(beam))
         if key not in row_lengths:
             row_lengths[key] = find_row_length(directions)
-        faces = _triangulate_image(points, use, directions, row_lengths[key], layout.stride)
+        row_length = row_lengths[key]
+    faces = _triangulate_image(points, use, directions, row_length, layout)
     faces, standoff = filter_faces(points, origin, faces)
     used = np.zeros(len(points), np.bool_)
     used[faces] = True
@@ -224,29 +221,10 @@ def _make_patch(
     return Patch(points[used], number[faces], beam[used], origin[used], standoff[used])
 
 
-def _triangulate_rows(points: Float, use: Bool, number: Int32, directions: Float) -> Int32:
-    """Triangles between successive planar scans, (R, W) numbers of their points."""
-    angle = np.array([median_angle(directions[a], directions[b]) for a, b in pairwise(number)])
-    usual = float(np.nanmedian(angle)) if np.isfinite(angle).any() else 0.0
-    kept, turned = [0], 0.0
-    breaks = []
-    for row, step in enumerate(angle, start=1):
-        turned += step if np.isfinite(step) else 0.0
-        if turned < _MIN_ROW_STEP * usual and row < len(number) - 1:
-            continue
-        if turned > _MAX_ROW_STEP * usual:
-            breaks.append(len(kept))
-        kept.append(row)
-        turned = 0.0
-    parts = np.split(number[kept], breaks)
-    faces = [triangulate_grid(points, use, part) for part in parts if len(part) > 1]
-    return np.concatenate([np.zeros((0, 3), np.int32), *faces])
-
-
 def _triangulate_image(
-    points: Float, use: Bool, directions: Float, row_length: int, stride: int
+    points: Float, use: Bool, directions: Float, row_length: int, layout: ScanLayout
 ) -> Int32:
-    """Triangles of one scan; a row length of 0 means that it is no grid."""
+    """Triangles of a range image; a row length of 0 means that it is no grid."""
     if not row_length:
         return _triangulate_without_grid(use, directions)
     number = np.arange(len(points), dtype=np.int32).reshape(-1, row_length)
@@ -254,11 +232,12 @@ def _triangulate_image(
     across = median_angle(directions[:-row_length], directions[row_length:])
     if median_angle(directions[number[:, -1]], directions[number[:, 0]]) < 2.0 * along:
         number = np.concatenate([number, number[:, :1]], axis=1)
-    if len(number) > 2 and median_angle(directions[number[-1]], directions[number[0]]) < (
-        2.0 * across
-    ):
+    if layout.is_planar:
+        return triangulate_grid(points, use, number)
+    around = median_angle(directions[number[-1]], directions[number[0]])
+    if len(number) > 2 and around < 2.0 * across:
         number = np.concatenate([number, number[:1]])
-    return triangulate_grid(points, use, number[::stride, ::stride])
+    return triangulate_grid(points, use, number[:: layout.stride, :: layout.stride])
 
 
 def _triangulate_without_grid(use: Bool, directions: Float) -> Int32:
