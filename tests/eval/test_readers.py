@@ -46,9 +46,9 @@ def test_seconds_are_those_of_the_text():
         ("0 1 2 3\n1 2 3\n", ":2", "4 finite"),
         ("0 1 2 3\n\n# x\n1 2 three 4\n", ":4", "4 finite"),
         ("0 1 2 3\n1 nan 2 3\n", ":2", "4 finite"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", ":2", "7 columns"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 nan\n", ":2", "not finite"),
-        ("1 2\n", ":1", "2 columns"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", ":2", "is no pose"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 nan\n", ":2", "is no pose"),
+        ("1 2\n", ":1", "is no pose"),
     ],
 )
 def test_bad_trajectories_name_the_line(tmp_path, text, place, what):
