@@ -205,6 +205,7 @@ def test_it_is_found_again_in_what_was_added(rooms):
     assert is_of(shown, CAME).sum() > 5
 
 
+@pytest.mark.slow
 def test_voxels_are_those_of_the_map(rooms):
     _, known, second = rooms
     beams = next(iter_beams(second.recording))
