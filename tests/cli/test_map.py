@@ -215,7 +215,7 @@ def test_poses_that_do_not_match_are_refused(call, room, tmp_path, nothing_left)
     file = tmp_path / "poses.tum"
     for text, said in (
         ("".join(lines[:20] + lines[22:]), ("2 of 40 scans", "scan 20")),
-        ("".join(line.split(maxsplit=1)[1] for line in lines), (f"{file}:1", "7 columns")),
+        ("".join(line.split(maxsplit=1)[1] for line in lines), (f"{file}:1", "is no pose")),
         ("1 0 0 0 0 0 0 1\n", ("40 of 40 scans",)),
         ("", ("no poses",)),
     ):
