@@ -212,10 +212,9 @@ def _write_filtered(
 
 def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget") -> "Recording":
     """The recording at the poses of the map; in one cloud, without the motion during its scans."""
-    from stillmap.io.trajectory import poses_from_tum
     from stillmap.slam import deskew_recording
 
-    poses = poses_from_tum(result.folder / "trajectory.tum", recording)
+    poses = result.read_poses(recording)
     recording = result.calibrate(recording)
     if not target.marker:
         recording = deskew_recording(recording, poses, result.slam_options)

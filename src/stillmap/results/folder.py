@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core import arrays, config
 from stillmap.core.array_folder import parse
@@ -19,6 +20,7 @@ from stillmap.io import read
 from stillmap.io.reader import read_parts
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.text_lines import Progress
+from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
 from stillmap.pipeline.options import MapMode, Options, OutputOptions
 from stillmap.pipeline.quality import Quality
@@ -195,6 +197,14 @@ class ResultFolder(ShortRepr):
             recording = read(source, read_as, progress=progress, scratch=scratch)
         mapped = match_labels(recording, labels, str(source))
         return recording if left_out else mapped, labels
+
+    def read_poses(self, recording: Recording) -> NDArray[np.float64]:
+        """The estimated poses (T, D+1, D+1) T_map_base of a recording that was read by `read`.
+
+        Raises:
+            InputError: the trajectory is missing or damaged.
+        """
+        return poses_from_tum(self.folder / "trajectory.tum", recording)
 
     def calibrate(self, recording: Recording) -> Recording:
         """The recording with mounts and odometry as they were calibrated for the map.
