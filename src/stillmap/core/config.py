@@ -159,7 +159,7 @@ def to_dict(options: Any) -> dict[str, Any]:
 def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
     """All options, section by section; options of a section come before its sub-sections."""
     sections = _section_names(options)
-    for name, info in _fields(options).items():
+    for name, info in declared_fields(options).items():
         if name not in sections:
             yield _describe_option(f"{prefix}{name}", getattr(options, name), info)
     for name in sections:
@@ -189,7 +189,7 @@ def _limits(info: FieldInfo) -> str:
 def iter_names(options: Any, prefix: str = "") -> Iterator[str]:
     """Names of all options and sections."""
     sections = _section_names(options)
-    yield from (f"{prefix}{name}" for name in _fields(options) if name not in sections)
+    yield from (f"{prefix}{name}" for name in declared_fields(options) if name not in sections)
     for name in sections:
         yield f"{prefix}{name}"
         yield from iter_names(getattr(options, name), f"{prefix}{name}.")
@@ -283,7 +283,7 @@ def _heading(options: Any, section: str) -> Iterator[str]:
     yield from ("", f"# {summary}", f"[{section}]")
 
 
-def _fields(options: Any) -> dict[str, FieldInfo]:
+def declared_fields(options: Any) -> dict[str, FieldInfo]:
     """Options of pydantic; of a plain dataclass its sections."""
     declared: dict[str, FieldInfo] = getattr(options, "__pydantic_fields__", {})
     return declared
@@ -295,4 +295,4 @@ def _section_names(options: Any) -> list[str]:
 
 
 def _names(options: Any) -> set[str]:
-    return {*_fields(options), *_section_names(options)}
+    return {*declared_fields(options), *_section_names(options)}

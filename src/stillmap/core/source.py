@@ -30,7 +30,8 @@ class LaserPose:
         if given == (None, None, None):
             return self
         own = (self.x, self.y, self.theta)
-        return LaserPose(*(o if g is None else g for o, g in zip(own, given, strict=True)), "given")
+        x, y, theta = (o if g is None else g for o, g in zip(own, given, strict=True))
+        return LaserPose(x, y, theta, "given")
 
 
 @dataclass(frozen=True)

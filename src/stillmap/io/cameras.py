@@ -16,7 +16,7 @@ quaternion = [-0.5, 0.5, -0.5, 0.5]
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,7 +138,7 @@ class CameraOverride:
     def apply_to(self, camera: Camera) -> Camera:
         """The camera with the given values in place of its own."""
         distortion = None if self.model is None else np.array(self.distortion or (), np.float64)
-        given = {
+        given: dict[str, Any] = {
             "K": self.intrinsics(),
             "width": self.width,
             "height": self.height,

@@ -168,7 +168,8 @@ def _initial_scales(
     scale = np.minimum(np.sqrt(metres / np.maximum(pixels, 1e-300)) / _MIN_TEXEL, 1.0)
     scale = np.minimum(scale, (room - 3.0) / np.maximum(edge, 1))
     texels = float(np.sum(pixels * scale * scale))
-    return scale * min(1.0, float(np.sqrt(_FILL * _MAX_PAGES * room * room / max(texels, 1.0))))
+    fitting = float(np.sqrt(_FILL * _MAX_PAGES * room * room / max(texels, 1.0)))
+    return np.asarray(scale * min(1.0, fitting))
 
 
 def _run_xatlas(

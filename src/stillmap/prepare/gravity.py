@@ -70,9 +70,9 @@ def _collect_surfaces(recording: Recording, T: Float) -> _Surfaces:
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
     scans = np.unique(np.linspace(0, recording.n_scans - 1, _MAX_SCANS).astype(np.intp))
     for scan in recording.iter_scans(scans.tolist()):
-        grid = recording.points[recording.beams_of(scan)].reshape(rows, columns, 3)
+        image = recording.points[recording.beams_of(scan)].reshape(rows, columns, 3)
         hit = recording.hit[recording.beams_of(scan)].reshape(rows, columns)
-        corners = np.where(hit[..., None], grid, np.nan)[::step, ::step].astype(np.float64)
+        corners = np.where(hit[..., None], image, np.nan)[::step, ::step].astype(np.float64)
         corner, right, below = corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1]
         normal = np.cross(below - corner, right - corner).reshape(-1, 3)
         length = np.linalg.norm(normal, axis=1)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
 from stillmap.core.recording import Recording
-from stillmap.core.source import Source
+from stillmap.core.source import RangeRule, Source
 from stillmap.prepare import max_range
-from stillmap.prepare.max_range import RangeRule
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 Float = NDArray[np.float64]

@@ -81,11 +81,10 @@ def _limit_ranges(recording: Recording, options: ReadOptions) -> Recording:
     recording = replace(recording, source=source)
     if not set(names) & set(_LIMITS):
         return recording
-    points, hit = (
-        # of a reader that has just made it: nobody else has it
-        array if array.flags.writeable else arrays.copy(array, recording.scratch)
-        for array in (recording.points, recording.hit)
-    )
+    points, hit = recording.points, recording.hit
+    # those that can be written are of a reader that has just made them: nobody else has them
+    points = points if points.flags.writeable else arrays.copy(points, recording.scratch)
+    hit = hit if hit.flags.writeable else arrays.copy(hit, recording.scratch)
     for block in arrays.iter_blocks(points, hit):
         _limit_block(points[block], hit[block], options)
     return replace(recording, points=points, hit=hit)

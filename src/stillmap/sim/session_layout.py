@@ -138,7 +138,8 @@ class Floor:
             return Place(float(x), float(y), near.yaw + turn)
         node = nodes[rng.integers(len(nodes))]
         if rng.random() >= _AGAINST_WALL:
-            return Place(*node.tolist(), float(rng.uniform(-math.pi, math.pi)))
+            x, y = node.tolist()
+            return Place(x, y, float(rng.uniform(-math.pi, math.pi)))
         long = self._walls[self._lengths > size[0] + 0.1]
         if not len(long):
             return None
@@ -179,7 +180,7 @@ class Floor:
 def _points(space: FreeSpace, nodes: NDArray[np.bool_]) -> Float:
     """(K, 2) metres, of the nodes of a mask (H, W)."""
     rows, columns = np.nonzero(nodes)
-    return space.origin + np.column_stack([columns, rows]) * space.spacing
+    return np.asarray(space.origin + np.column_stack([columns, rows]) * space.spacing)
 
 
 def meets_box(solid: Float, place: Place, half: Float) -> bool:

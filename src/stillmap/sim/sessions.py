@@ -153,7 +153,8 @@ def write_sessions(
         InputError: no room for robot or people, or the folder holds something already.
     """
     total = sum(len(plan.scenes) for plan in plans)
-    about, counts = [], []
+    about: list[dict[str, Any]] = []
+    counts: list[dict[str, Any]] = []
     with atomic_folder(Path(path), SESSIONS_MARK, overwrite) as work:
         for place, plan in enumerate(plans):
             for simulation in simulate_sessions(plan):
@@ -271,10 +272,9 @@ def _mount_sensor(scene: Scene, is_odd: bool, rng: np.random.Generator) -> Scene
     """The scene with a mount of its own; odd: half the beams or a narrower field of view."""
     x, y, yaw = rng.uniform((-0.1, -0.1, -0.4), (0.2, 0.1, 0.4)).tolist()
     narrow = rng.random() < 0.5
-    laser, lidar = (
-        replace(sensor, x=sensor.x + x, y=sensor.y + y, yaw=sensor.yaw + yaw)
-        for sensor in (scene.laser, scene.lidar)
-    )
+    laser, lidar = scene.laser, scene.lidar
+    laser = replace(laser, x=laser.x + x, y=laser.y + y, yaw=laser.yaw + yaw)
+    lidar = replace(lidar, x=lidar.x + x, y=lidar.y + y, yaw=lidar.yaw + yaw)
     if is_odd:
         fov = laser.fov * (0.75 if narrow else 1.0)
         laser = replace(

@@ -101,10 +101,9 @@ def load_image_truth(path: str | Path) -> ImageTruth:
     folder = _find_folder(path, STANDING, "truth about images", " with cameras")
     try:
         of, moves = (read_npz(folder / name, None, _MAX_ARRAY) for name in (STANDING, MOVING))
-        faces, solids, ground = (
-            kind(*(of[f"{name}_{field}"] for field in kind._fields))
-            for name, kind in (("faces", Faces), ("solids", Solids), ("ground", Ground))
-        )
+        faces = Faces._make(of[f"faces_{field}"] for field in Faces._fields)
+        solids = Solids._make(of[f"solids_{field}"] for field in Solids._fields)
+        ground = Ground._make(of[f"ground_{field}"] for field in Ground._fields)
         ceiling, seed = float(of["ceiling"]), int(of["colour_seed"])
         parts = Solids(open_npy(folder / POSE), *(moves[name] for name in Solids._fields[1:]))
         moving = MovingSurfaces(moves["stamp_ns"], parts)

@@ -105,10 +105,10 @@ def _write_truth(of_beams: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> 
 
 def _write_image_truth(surfaces: ImageTruth, folder: Path) -> None:
     """All but masks and distances."""
-    *parts, ceiling = surfaces.standing
+    faces, solids, ground, ceiling = surfaces.standing
     standing = {
         f"{name}_{key}": np.asarray(value)
-        for name, part in zip(("faces", "solids", "ground"), parts, strict=True)
+        for name, part in (("faces", faces), ("solids", solids), ("ground", ground))
         for key, value in part._asdict().items()
     }
     standing["ceiling"] = np.array(np.nan if ceiling is None else ceiling)

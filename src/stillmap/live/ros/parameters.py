@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from stillmap.core.config import STRICT, option, override
+from stillmap.core.config import STRICT, declared_fields, option, override
 
 
 def _to_tuple(values: Any) -> tuple[Any, ...]:
@@ -84,11 +84,11 @@ def declare(declare_one: Callable[[str, Any, str], Any], **defaults: Any) -> Par
     Raises:
         InputError: a value is of the wrong type, or out of range.
     """
-    values = {}
+    fields, values = declared_fields(Parameters), {}
     for field in dataclasses.fields(Parameters):
         default = defaults.get(field.name, getattr(Parameters(), field.name))
         if isinstance(default, tuple):  # ROS knows lists; one name is plain
             default = default[0] if len(default) == 1 else list(default)
-        meaning = Parameters.__pydantic_fields__[field.name].description
+        meaning = fields[field.name].description
         values[field.name] = declare_one(field.name, default, meaning or "")
     return override(Parameters(), values, "parameters")

@@ -299,8 +299,8 @@ def _to_cloud(arrival: Arrival, p_static: NDArray[np.float32], chosen: NDArray[n
 
 def _copy_scan(scan: Any, ranges: NDArray[np.float32]) -> Any:
     """A LaserScan as another one, with other ranges."""
-    names = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time")
-    names += ("range_min", "range_max", "intensities")
+    names = ["angle_min", "angle_max", "angle_increment", "time_increment", "scan_time"]
+    names += ["range_min", "range_max", "intensities"]
     return LaserScan(
         header=_to_header(scan.header.frame_id, stamp_ns(scan.header)),
         ranges=_to_data(ranges.astype(np.float32), "f"),
