@@ -5,6 +5,7 @@ import pytest
 
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
+from stillmap.results.viewer import beams as viewer_beams
 from stillmap.results.viewer.beams import Beams
 from stillmap.slam import SlamOptions, deskew_recording
 
@@ -48,3 +49,12 @@ def test_dynamic_ends(beams):
     some = beams.dynamic_ends(5)
     assert len(some) == 5
     assert all((np.abs(ends - one).max(axis=1) < 1e-5).any() for one in some)
+
+
+def test_of_a_long_recording_not_every_block_is_read(beams, monkeypatch):
+    """Showing hours does not take as long as mapping them."""
+    monkeypatch.setattr(viewer_beams, "_BLOCK_SCANS", 1)
+    monkeypatch.setattr(viewer_beams, "_MAX_READ", beams.recording.n_beams // 2)
+    views = [beams.scan_view(scan) for scan in range(beams.recording.n_scans)]
+    counts = [int((view.p_static < 0.5).sum()) for view in views]
+    assert 0 < len(beams.dynamic_ends(10_000)) < sum(counts)

@@ -15,6 +15,8 @@ from stillmap.slam.options import SlamOptions
 Float = NDArray[np.float64]
 
 MAX_BEAMS = 60_000  # shown of a scan
+_BLOCK_SCANS = 256  # deskewed at once
+_MAX_READ = 20_000_000  # beams read to find the dynamic ones, which takes seconds
 # scans before and after one from which it is deskewed; in 2D several lasers may take turns
 _NEIGHBORS = {2: 8, 3: 1}
 
@@ -69,8 +71,19 @@ class Beams:
         return ScanView(ends, p_static, origin)
 
     def dynamic_ends(self, max_count: int) -> Float:
-        """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns."""
-        deskewed = deskew_recording(self.recording, self.poses, self.slam)
-        ends = sample_dynamic_points(deskewed, self.poses, self.p_static, max_count)
-        self.recording.release_pages(self.p_static)
-        return ends.astype(np.float64)
+        """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns.
+
+        The recording is read in blocks of scans; of a long one not every block.
+        """
+        offset, T = self.recording.offset, self.recording.n_scans
+        blocks = np.arange(0, T, _BLOCK_SCANS)
+        most = max(1, _MAX_READ * len(blocks) // max(self.recording.n_beams, 1))
+        parts = [np.zeros((0, self.recording.dimension))]
+        for first in blocks[sample_indices(len(blocks), most)].tolist():
+            end = min(first + _BLOCK_SCANS, T)
+            poses, p_static = self.poses[first:end], self.p_static[offset[first] : offset[end]]
+            block = deskew_recording(self.recording.slice_scans(first, end), poses, self.slam)
+            parts.append(sample_dynamic_points(block, poses, p_static, len(p_static)))
+            self.recording.release_pages(self.p_static)
+        ends = np.concatenate(parts)
+        return ends[sample_indices(len(ends), max_count)]
