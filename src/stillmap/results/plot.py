@@ -2,7 +2,7 @@
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +32,7 @@ def plot_result(
     ax: "Axes | None",
     *,
     trajectory: bool,
-    moving: Sequence[MappedPlace],
+    moving: Iterable[MappedPlace],
     changes: bool,
 ) -> "Axes":
     """See `Result.plot`; dynamic returns are those of the sessions `moving`."""

@@ -121,7 +121,7 @@ class Result(MappedPlace):
             MissingExtra: matplotlib is not installed.
         """
         names = [one.name for one in self.sessions if one.accepted] if dynamic else []
-        moving = [self.load_session(name) for name in names]
+        moving = (self.load_session(name) for name in names)  # one in memory at a time
         return plot_result(self, ax, trajectory=trajectory, moving=moving, changes=changes)
 
     def to_arrow(self, table: TableName = "beams") -> pyarrow.Table:
