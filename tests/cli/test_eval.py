@@ -157,7 +157,9 @@ def test_trajectory(capsys, simulated, result):
     s = scores(capsys, "trajectory", result / "trajectory.tum", reference, *frames)
     assert s["rpe"]["pairs"] == 57
     assert main(["eval", "trajectory", str(reference), str(reference)]) == 0
-    assert "ate                     rmse " in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "ate                     rmse " in out
+    assert "units                   m, deg\n" in out
 
 
 def test_trajectories_without_a_common_time(capsys, texts, tmp_path):

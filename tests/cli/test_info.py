@@ -80,6 +80,7 @@ def test_text(path, capsys):
         "first stamp": "100.000000000 s",
         "path length": "5 m",
         "field of view": "-90, 45 deg",
+        "angle step": "45 deg",
         "extrinsics": "x 0.25, y 0, theta 0 deg, how PARAM",
         "params": "robot frontlaser offset 0.25",
     }.items():

@@ -103,14 +103,15 @@ def print_rows(content: Mapping[str, Any]) -> None:
 
 
 def format_rows(content: Mapping[str, Any], indent: str = "") -> Iterator[str]:
-    """Yield a line for each entry of a JSON object, without empty ones.
+    """Yield a line for each entry of a JSON object, without empty ones; of sentences, one for each.
 
     Keys may end with a unit, as in `duration_s`; stamps in nanoseconds are shown in seconds. Short
     objects are shown on one line, others entry by entry, indented.
     """
     for key, value in content.items():
         title, unit = _split_unit(key)
-        is_table = isinstance(value, list | tuple) and any(isinstance(item, dict) for item in value)
+        is_list = isinstance(value, list | tuple)
+        is_table = is_list and any(isinstance(item, dict | str) for item in value)
         for item in value if is_table else [value]:
             if item in _EMPTY:
                 continue

@@ -27,6 +27,13 @@ _SCORES = {
     "map": "ghost cells, and the share of walls that the map shows, against a simulation's truth",
 }
 
+# what the names of the scores, unlike those of `stillmap info`, do not say
+_UNITS = {
+    "relations": "m, deg, and their squares",
+    "trajectory": "m, deg",
+    "map": "m, m2, rad (T world map: x, y, theta)",
+}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the four scores."""
@@ -120,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(scores)
     else:
-        print_rows(scores)
+        print_rows({**scores, "units": _UNITS.get(args.score)})
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -72,4 +73,12 @@ def _format_summary(info: dict[str, Any]) -> Iterator[str]:
     yield f"{info['input']}: {info['format'] or 'stillmap recording'}, {info['dimension']}D"
     path = info["path"] if info["path"] != info["input"] else None
     shown = {key: value for key, value in info.items() if key not in _HIDDEN}
-    yield from format_rows({"made_from": path, **shown, "path": None})
+    sensors = [_in_degrees(sensor) for sensor in info["sensors"]]
+    yield from format_rows({"made_from": path, **shown, "path": None, "sensors": sensors})
+
+
+def _in_degrees(sensor: dict[str, Any]) -> dict[str, Any]:
+    """A sensor with its angles, which are in rad, as those of its pose and field of view."""
+    angles = {key: sensor[key] for key in ("start_angle", "angle_step") if sensor.get(key)}
+    degrees = {f"{key}_deg": math.degrees(value) for key, value in angles.items()}
+    return {key: value for key, value in sensor.items() if key not in angles} | degrees
