@@ -41,7 +41,7 @@ def track_objects_3d(
     """Detect and track the moving objects of a 3D recording, with the height of track and box.
 
     What goes nowhere, and whose place is never seen empty, is left out (`displacement.py`), and so
-    are parts of static surfaces (`attachment.py`).
+    are parts of static surfaces (`displacement.py`).
 
     Dynamic end points in connected columns above the ground are one segment. The nearest point in
     each direction, which a planar laser would see, is tracked; the other points of a segment
