@@ -1,4 +1,4 @@
-"""How much of a session lies in the area that another one observed."""
+"""Overlap of sessions: the share of one that lies in the area that another observed."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

@@ -37,7 +37,7 @@ class Request(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a task ended.
+    """The outcome of a task.
 
     Attributes:
         status: `done`, `failed`, or `full`: a disk is, and no task can go on.

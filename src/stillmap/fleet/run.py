@@ -204,7 +204,7 @@ def _run_tasks(client: Any, tasks: Sequence[Task], request: Request) -> dict[str
 
 
 def _outcome(future: Any, client: Any, request: Request) -> Outcome:
-    """How a task ended.
+    """The outcome of a task.
 
     Raises:
         InputError: the scheduler is gone.

@@ -130,7 +130,7 @@ def _make(task: Task, command: Callable[[list[str]], None]) -> Outcome:
 
 
 def read_made(root: str, folder: str) -> Outcome | None:
-    """How the result in a folder of a fleet was made; None where there is no whole one."""
+    """The outcome of the task that made the result in a folder; None: there is no whole one."""
     fs, path = open_location(root)
     with explain(f"{root}/{folder}", "read"):
         try:

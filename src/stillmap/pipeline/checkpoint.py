@@ -1,4 +1,4 @@
-"""What `--resume` goes on from: the state of EM after the last finished iteration of a run.
+"""Checkpoints for `--resume`: the state of EM after the last finished iteration of a run.
 
 It lies in `.NAME.resume/iteration-K/` beside the output NAME, with the key of the run: version,
 options, and a hash of its input. The folder is locked while the run lasts.

@@ -73,7 +73,7 @@ def better_source(
 
 
 def _is_better(tried: IterationRecord, best: IterationRecord, source: str) -> bool:
-    """Whether a source is better than the best iteration.
+    """True if a source is better than the best iteration.
 
     A stretch is predicted by the scans between the ones that are held out, which lie wrong with
     them. There, about the same prediction is enough if the bound, which is over all scans, rises.

@@ -334,7 +334,7 @@ class _Quality:
 
 @dataclass(frozen=True)
 class _Run:
-    """What is read of `run.json`."""
+    """The entries of `run.json` that are read."""
 
     input: dict[str, Any]
     options: dict[str, dict[str, Any] | Any] | None = None

@@ -1,4 +1,4 @@
-"""How the estimation went: the likelihood over the iterations (Fig. 5), and what was fitted."""
+"""The course of the estimation: the likelihood over the iterations (Fig. 5), fitted values."""
 
 import itertools
 import math
