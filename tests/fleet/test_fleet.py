@@ -217,6 +217,11 @@ def test_two_fleets_in_one_folder(stand_in, logs, tmp_path):
     assert sorted(os.listdir(out)) == ["fleet.html", "fleet.json", "results"]
 
 
+def test_bad_input_leaves_nothing(stand_in, tmp_path):
+    assert stand_in(tmp_path / "missing-*.bag", "-o", tmp_path / "a/b/out").returncode == 2
+    assert os.listdir(tmp_path) == []
+
+
 def test_folder_that_cannot_be_written(stand_in, logs, tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))

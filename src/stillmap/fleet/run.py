@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -83,7 +82,8 @@ def _hold_output(root: str) -> Iterator[None]:
             fs.rm_file(f"{path}/{_LOCK}")
         yield
         return
-    folder, was_there = Path(path), os.path.lexists(path)
+    folder = Path(path)
+    made = [missing for missing in (folder, *folder.parents) if not missing.exists()]
     try:
         file = hold_lock(folder / _LOCK, "another fleet is writing there", root)
     except OSError as error:
@@ -93,8 +93,8 @@ def _hold_output(root: str) -> Iterator[None]:
     finally:
         (folder / _LOCK).unlink(missing_ok=True)
         with suppress(OSError):  # it holds something
-            if not was_there:
-                folder.rmdir()
+            for empty in made:
+                empty.rmdir()
         file.close()
 
 
