@@ -16,7 +16,7 @@ from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.core.source import Source
+from stillmap.core.source import SensorNotes, Source
 from stillmap.io import read, write
 from stillmap.prepare.options import ReadOptions
 
@@ -330,3 +330,13 @@ def test_headers_that_lie_about_pictures(tmp_path, changed):
     file.write_text(json.dumps(json.loads(file.read_text()) | changed))
     with pytest.raises(InputError):
         read(tmp_path / "rec")
+
+
+@pytest.mark.parametrize("grid", [(5, 5), (0, 0), (-1, -1)])
+def test_grids_that_scans_do_not_have_are_not_levelled(tmp_path, grid):
+    recording = made(D=3, counts=(12, 12))
+    sensors = [SensorNotes("depth", grid=grid)]
+    write(replace(recording, source=Source(sensors=sensors)), tmp_path / "rec")
+    again = read(tmp_path / "rec")
+    assert "levelled" not in again.source.details
+    np.testing.assert_array_equal(again.T_recorded_base, recording.T_recorded_base)

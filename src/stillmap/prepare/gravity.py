@@ -41,9 +41,8 @@ def align_to_gravity(recording: Recording) -> Recording:
     Args:
         recording: any; only one of a depth camera, whose scans are grids, is not levelled yet.
     """
-    T, sensors = recording.T_recorded_base, recording.source.sensors
-    is_depth = bool(sensors) and sensors[0].grid is not None
-    if T is None or not is_depth or "levelled" in recording.source.details:
+    T = recording.T_recorded_base
+    if T is None or not _has_grids(recording) or "levelled" in recording.source.details:
         return recording
     mean = T[:, :3, 2].mean(axis=0)
     length = float(np.linalg.norm(mean))
@@ -55,6 +54,15 @@ def align_to_gravity(recording: Recording) -> Recording:
     angle = float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
     note = {"by": by, "turned_deg": round(angle, 2), "up": [round(float(v), 6) for v in up]}
     return _with_note(replace(recording, T_recorded_base=rotation @ T), note)
+
+
+def _has_grids(recording: Recording) -> bool:
+    """True if all scans are grids as noted; a damaged folder may note any."""
+    sensors = recording.source.sensors
+    if not sensors or sensors[0].grid is None:
+        return False
+    rows, columns = sensors[0].grid
+    return min(rows, columns) > 0 and bool(np.all(np.diff(recording.offset) == rows * columns))
 
 
 def _with_note(recording: Recording, what: dict[str, Any]) -> Recording:
