@@ -17,6 +17,7 @@ from stillmap.core.input_files import (
     InputPath,
     ShorterFileError,
     copy_content,
+    hold_lock,
     read_bytes,
     read_text,
 )
@@ -151,3 +152,9 @@ assert array.sum() == 1 << 23
         [sys.executable, "-c", script, str(tmp_path / "a.npy")], check=False, timeout=60
     )
     assert done.returncode == 0
+
+
+def test_lock_that_is_a_link_leading_nowhere(tmp_path):
+    (tmp_path / "lock").symlink_to(tmp_path / "gone" / "lock")
+    with pytest.raises(OSError, match="symbolic links"):
+        hold_lock(tmp_path / "lock", "is locked", "out")

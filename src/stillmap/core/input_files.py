@@ -163,14 +163,16 @@ def hold_lock(path: Path, what: str, where: str) -> IO[bytes]:
 
     Raises:
         InputError: another process holds the lock, or the file is no regular one.
-        OSError: the file cannot be made.
+        OSError: the file cannot be made, or it is a link.
     """
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # the process that had it has just ended
             if path.exists():
                 require_regular(path)  # to open a pipe would wait for its reader
-            file = path.open("ab")
+            # a link that leads nowhere would be made again and again
+            flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
+            file = os.fdopen(os.open(path, flags, 0o666), "wb")
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
