@@ -21,7 +21,7 @@ DESCRIPTION = (
 
 def _list_scenes() -> str:
     """Name and first line of the data file of each scene."""
-    about = {"building": "grows with --scans, wing by wing"}
+    about = {}
     for file in (resources.files("stillmap") / "sim" / "worlds").iterdir():
         if file.name.endswith(".toml"):
             with file.open(encoding="utf-8") as text:

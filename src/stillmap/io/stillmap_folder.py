@@ -188,8 +188,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     T, M, D = header.scans, header.beams, header.dimension
 
     def load(name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-        array = read_array(path / f"{name}.npy", shape, dtype, scratch, grows=grows)
-        return np.ascontiguousarray(array)
+        return read_array(path / f"{name}.npy", shape, dtype, scratch, grows=grows)
 
     def load_poses(name: str, count: int) -> NDArray[np.float64]:
         return read_poses(path / f"{name}.npy", count, D, MAX_TRANSLATION, grows=grows)

@@ -176,7 +176,7 @@ def _add_all(
                 pending.remove(session)
                 refusals.pop(session.name, None)
                 grew = True
-    return place, [refusals[session_left.name] for session_left in pending]
+    return place, [refusals[session.name] for session in pending]
 
 
 def _step(progress: Progress, session: Session) -> Callable[[str], None]:

@@ -102,7 +102,7 @@ def write_log(recording: Recording, path: Path) -> list[str]:
 
 def _format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
     """The lines of a log with line ends: for every scan its odometry, then the scan."""
-    yield "# stillmap convert\n"
+    yield "# written by stillmap\n"
     first = int(recording.stamp_ns[0])
     for name, value in form.params.items():
         yield f"PARAM {name} {value} {format_seconds(first)} {_HOST} {format_seconds(0)}\n"
