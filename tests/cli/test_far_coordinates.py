@@ -1,6 +1,7 @@
 """The commands with poses in a map projection, and with poses that cannot be."""
 
 import json
+import shutil
 
 import laspy
 import numpy as np
@@ -68,8 +69,15 @@ def test_clouds_keep_the_millimetre(call, mapped, tmp_path):
         assert apart.max() < 1e-3
 
 
-def test_static_points_of_a_bag_are_near(call, mapped, tmp_path):
-    assert call("convert", mapped, "-o", tmp_path / "a.mcap", "--quiet").returncode == 0
+@pytest.mark.parametrize("states_origin", [True, False])
+def test_static_points_of_a_bag_are_near(call, mapped, tmp_path, states_origin):
+    """Also of a session of a place, whose record states no origin."""
+    result = shutil.copytree(mapped, tmp_path / "result")
+    if not states_origin:
+        record = json.loads((result / "run.json").read_text())
+        del record["local_origin"]
+        (result / "run.json").write_text(json.dumps(record))
+    assert call("convert", result, "-o", tmp_path / "a.mcap", "--quiet").returncode == 0
     with AnyReader([tmp_path / "a.mcap"], default_typestore=get_typestore(Stores.EMPTY)) as reader:
         messages = {
             connection.topic: reader.deserialize(data, connection.msgtype)

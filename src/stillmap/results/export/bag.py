@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.grid_map import limit_hits
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.ros import writer as ros
@@ -76,12 +77,12 @@ def write(
     encoder = LaserScanEncoder(recording) if recording.dimension == 2 else None
     seen = recording if recording.dimension == 2 else result.deskewed
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        near = result.loaded.frame
+        near = LocalFrame.near(result.poses)  # sessions of a place state no frame of their own
         more = [(MAP, _LOCAL, near.to_map(np.eye(4)))] if near.is_shifted else []
         frames = write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
         if encoder is None:
-            _write_static_points(bag, result, seen)
+            _write_static_points(bag, result, seen, near)
             write_scan = _make_sweep_writer(bag, result, seen, frames)
         else:
             write_scan = _make_scan_writer(bag, result, encoder, frames)
@@ -112,10 +113,11 @@ def _write_latched_topics(bag: BagWriter, result: MappedPlace) -> None:
     send(first, ros.make_path(bag, stamp_ns, result.poses))
 
 
-def _write_static_points(bag: BagWriter, result: MappedPlace, deskewed: Recording) -> None:
+def _write_static_points(
+    bag: BagWriter, result: MappedPlace, deskewed: Recording, near: LocalFrame
+) -> None:
     """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
     programs expect coordinates of 32 bits."""
-    near = result.loaded.frame
     seen = limit_hits(deskewed, result.poses, result.loaded.region)
     cloud = cloud_from_recording(
         result.recording, seen, result.poses, result.p_static, "static", result.colors
