@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -83,7 +84,7 @@ def _hold_output(root: str) -> Iterator[None]:
         yield
         return
     folder = Path(path)
-    made = [missing for missing in (folder, *folder.parents) if not missing.exists()]
+    made = [part for part in (folder, *folder.parents) if not os.path.lexists(part)]
     try:
         file = hold_lock(folder / _LOCK, "another fleet is writing there", root)
     except OSError as error:
