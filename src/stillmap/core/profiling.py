@@ -104,7 +104,7 @@ def show_progress(iterations: int, say: Callable[[str], None] = print_line) -> I
 
 @contextmanager
 def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
-    """What shows steps on stderr: a bar on a terminal, elsewhere a line now and then."""
+    """Show steps on stderr: by a bar on a terminal, elsewhere by a line now and then."""
     if _shows_bar():
         with _show_bar() as show:
             yield show

@@ -117,7 +117,7 @@ def _without_unknown(entries: list[tuple[str, Any]]) -> dict[str, Any]:
 
 @dataclass
 class Source:
-    """What a reader notes; `details` are for people alone.
+    """Notes of a reader; `details` are for people alone.
 
     Attributes:
         path: of the file or folder.

@@ -176,9 +176,9 @@ def _borrow_angles(
     """Angles of another scan of the laser, where they fit; else a full turn."""
     points = recording.points[recording.beams_of(t)].astype(np.float64)
     usable = np.flatnonzero(np.isfinite(points[:, 0]))
-    found = known[int(recording.sensor[t])].get(len(points))
-    if found is not None and _fits(found, points, usable):
-        return found
+    borrowed = known[int(recording.sensor[t])].get(len(points))
+    if borrowed is not None and _fits(borrowed, points, usable):
+        return borrowed
     # at most one usable beam: its angle is exact for any step
     step = 2 * np.pi / max(len(points), 1)
     angle = [np.arctan2(points[k, 1], points[k, 0]) - step * k for k in usable]

@@ -233,7 +233,7 @@ def _find_break(before: Recording, after: Recording) -> str:
 
 
 def _find_jump(before: Recording, after: Recording, A: Float, B: Float) -> str:
-    """How poses of one part do not go on with those of the one before; "" where they do."""
+    """The gap between the poses of one part and the one before; "" where they go on."""
     step = _measure_motions(A[-1:], B[:1])[0]
     seconds = abs(int(after.stamp_ns[0]) - int(before.stamp_ns[-1])) / 1e9 + _SLACK
     usual = np.maximum(_usual_speed(before, A), _usual_speed(after, B))

@@ -192,7 +192,7 @@ def _read_list(path: Path, warnings: list[str]) -> list[tuple[int, Path]]:
             bad += 1
     if bad:
         warnings.append(f"{path.name}: {bad} lines are not a stamp and a file of the folder")
-    return sorted(out, key=lambda one: one[0])
+    return sorted(out, key=lambda pair: pair[0])
 
 
 def _interpolate_tum_poses(
@@ -335,8 +335,8 @@ def _make_grid(camera: Camera, options: ReadOptions, scale: float) -> _Grid:
     for first in range(0, len(rows), some):
         part = np.meshgrid(columns, rows[first : first + some])
         pixels = np.stack(part, axis=-1).reshape(-1, 2).astype(np.float64)
-        found = camera_module.unproject(camera, pixels) @ T_BASE_CAMERA[:3, :3].T
-        rays[first : first + some] = found.reshape(-1, len(columns), 3)
+        directions = camera_module.unproject(camera, pixels) @ T_BASE_CAMERA[:3, :3].T
+        rays[first : first + some] = directions.reshape(-1, len(columns), 3)
     return _Grid(camera.width, camera.height, step, rays, scale)
 
 

@@ -59,8 +59,8 @@ def calibrate_color_camera(
     score, score_apart = _score(registered, edges), _score(guess, edges)
     if not score_apart > _MIN_GAIN * score:
         return depth, ""
-    found = _maximize_score(guess, edges)
-    tx, ty, f, cx, cy = (round(float(value), 4) for value in found)
+    best = _maximize_score(guess, edges)
+    tx, ty, f, cx, cy = (round(float(value), 4) for value in best)
     T = np.eye(4)
     T[:2, 3] = -tx, -ty
     assert depth.T_base_camera is not None
@@ -85,7 +85,7 @@ def _maximize_score(guess: Float, edges: Sequence[_Edges]) -> Float:
         return -_score(numbers, edges)
 
     steps = np.array([0.005, 0.005, *(guess[2] * np.array([0.01, 0.006, 0.006]))])
-    found = fmin(
+    best = fmin(
         cost,
         guess,
         xtol=0.02,  # pixels
@@ -94,8 +94,8 @@ def _maximize_score(guess: Float, edges: Sequence[_Edges]) -> Float:
         disp=False,
         initial_simplex=np.vstack([guess, guess + np.diag(steps)]),
     )
-    found = np.asarray(found, np.float64)
-    return found if _shift(found, guess, edges) <= _MAX_SHIFT * guess[2] else guess
+    best = np.asarray(best, np.float64)
+    return best if _shift(best, guess, edges) <= _MAX_SHIFT * guess[2] else guess
 
 
 def _find_edges(K: Float, scale: float, pairs: Sequence[tuple[Path, Path]]) -> list[_Edges]:
@@ -116,7 +116,7 @@ def _find_edges(K: Float, scale: float, pairs: Sequence[tuple[Path, Path]]) -> l
         for axis in (0, 1):
             gradient = np.abs(np.gradient(smooth, axis=axis))
             out.append(_Edges(_depth_edges(depth / scale, K, axis), gradient))
-    return [one for one in out if len(one.points)]
+    return [edges for edges in out if len(edges.points)]
 
 
 def _depth_edges(depth: Float, K: Float, axis: int) -> Float:
@@ -161,8 +161,8 @@ def _score(parameters: Float, edges: Sequence[_Edges]) -> float:
     return total / max(count, 1)
 
 
-def _shift(found: Float, guess: Float, edges: Sequence[_Edges]) -> float:
+def _shift(best: Float, guess: Float, edges: Sequence[_Edges]) -> float:
     """90 % quantile of the pixels by which the edges move between two cameras."""
-    points = np.concatenate([one.points for one in edges])
-    (u, v), (u0, v0) = _project(found, points), _project(guess, points)
+    points = np.concatenate([edge.points for edge in edges])
+    (u, v), (u0, v0) = _project(best, points), _project(guess, points)
     return float(np.quantile(np.hypot(u - u0, v - v0), 0.9))

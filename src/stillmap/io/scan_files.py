@@ -46,10 +46,10 @@ def stamps_from_names(stems: Sequence[str]) -> list[int] | None:
     Numbers with decimals are seconds; integers of 13, 16 or 19 digits are milli-, micro- or
     nanoseconds since 1970.
     """
-    found = [one for stem in stems if (one := _parse_stamp(stem)) is not None]
-    if len(found) < len(stems) or len({unit for unit, _ in found}) != 1:
+    times = [time for stem in stems if (time := _parse_stamp(stem)) is not None]
+    if len(times) < len(stems) or len({unit for unit, _ in times}) != 1:
         return None
-    return [stamp for _, stamp in found]
+    return [stamp for _, stamp in times]
 
 
 def _parse_stamp(stem: str) -> tuple[int, int] | None:

@@ -93,9 +93,9 @@ class Crowd:
         if self._kept and 0 <= stamp_ns - self._kept[-1].stamp_ns < _SPACING_NS:
             return
         points = points[np.hypot(*points.T) > _BODY]
-        other = self._find_other(stamp_ns)
-        if other is not None and len(points) and len(other.points):
-            self._compare(points, other)
+        earlier = self._find_other(stamp_ns)
+        if earlier is not None and len(points) and len(earlier.points):
+            self._compare(points, earlier)
         self._kept.append(_Kept(stamp_ns, points, self._T_odom_base))
 
     def _find_other(self, stamp_ns: int) -> _Kept | None:
@@ -108,10 +108,10 @@ class Crowd:
                 return kept if metres <= _MAX_BASELINE else None
         return None
 
-    def _compare(self, points: NDArray[np.float32], other: _Kept) -> None:
-        tree = self._make_tree(other.points, balanced_tree=False, compact_nodes=False)
+    def _compare(self, points: NDArray[np.float32], earlier: _Kept) -> None:
+        tree = self._make_tree(earlier.points, balanced_tree=False, compact_nodes=False)
         thin = points[:: -(-len(points) // _MAX_HITS)].astype(np.float64)
-        T = se2.inverse(other.T_odom_base) @ self._T_odom_base
+        T = se2.inverse(earlier.T_odom_base) @ self._T_odom_base
         moved = thin @ T[:2, :2].T + T[:2, 2]
         along, static = (np.asarray(tree.query(at)[0], np.float64) for at in (thin, moved))
         share = _share(along, static)

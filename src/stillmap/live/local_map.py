@@ -68,9 +68,9 @@ class LocalMap:
         for scan in scans:
             self._insert(scan)
 
-    def join(self, other: "LocalMap", T: NDArray[np.float64]) -> None:
+    def join(self, later: "LocalMap", T: NDArray[np.float64]) -> None:
         """Add the scans of another map, which were taken later, moved by T (3, 3)."""
-        self.extend(replace(scan, T_map_base=T @ scan.T_map_base) for scan in other._scans)
+        self.extend(replace(scan, T_map_base=T @ scan.T_map_base) for scan in later._scans)
 
     def add(self, scan: MappedScan) -> bool:
         """Add a scan unless it is too close to the last one of its sensor; True if it was added."""
@@ -149,7 +149,7 @@ def relabel_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, label: Labeller)
 
 
 def is_spaced(last: MappedScan, scan: MappedScan) -> bool:
-    """Whether a scan shows enough that is new after the last one."""
+    """True if a scan shows enough that is new after the last one."""
     x, y, theta = se2.parameters(se2.inverse(last.T_map_base) @ scan.T_map_base)
     seconds = 1e-9 * (scan.beams.stamp_ns - last.beams.stamp_ns)
     return bool(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds >= SCAN_SPACING)

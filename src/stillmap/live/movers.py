@@ -202,14 +202,14 @@ class _Tracks:
     def begin(cls, center: Float, radius: Float, number: int, now_ns: int) -> "_Tracks":
         n = len(center)
         now = np.full(n, now_ns, np.int64)
-        one, no = np.ones(n, np.intp), np.zeros(n, np.bool_)
-        return cls(number + np.arange(n), center.copy(), radius, now, now.copy(), one, no)
+        ones, no = np.ones(n, np.intp), np.zeros(n, np.bool_)
+        return cls(number + np.arange(n), center.copy(), radius, now, now.copy(), ones, no)
 
     def select(self, kept: Mask) -> "_Tracks":
         return _Tracks(*(column[kept] for column in vars(self).values()))
 
-    def append(self, other: "_Tracks") -> "_Tracks":
-        columns = zip(vars(self).values(), vars(other).values(), strict=True)
+    def append(self, further: "_Tracks") -> "_Tracks":
+        columns = zip(vars(self).values(), vars(further).values(), strict=True)
         return _Tracks(*(np.concatenate(pair) for pair in columns))
 
 
@@ -274,8 +274,8 @@ def _to_covariances(P: Float, dimension: int) -> Float:
 
 
 def _measure(points: Float, of: Index, n: int, sensor: Float) -> tuple[Mask, Float, Float]:
-    """Which of n groups of points there are, their means (n, D), and half their widths (n,) across
-    the view from the sensor, horizontally."""
+    """A mask of the n groups that have points, their means (n, D), and half their widths (n,)
+    across the view from the sensor, horizontally."""
     member = of == np.arange(n)[:, None]
     count = member.sum(axis=1)
     seen = count > 0

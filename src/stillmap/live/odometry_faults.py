@@ -198,7 +198,7 @@ class OdometryFaults:
         if slip is not None:
             back = min(self._count - slip.first, len(self._stamps))
             # the velocity is that of the hypothesis, too
-            before = [slip.before, *(one.T_map_base for one in slip.matches)][-2]
+            before = [slip.before, *(step.T_map_base for step in slip.matches)][-2]
             self._standing.reset()
             return Fault(self._stamps[-back] if back else None, before, slip.matches[-1])
         increment = self.increment

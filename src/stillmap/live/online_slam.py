@@ -205,7 +205,7 @@ class OnlineSlam:
         return dataclasses.replace(hits, weights=weights)
 
     def _judge(self, registered: Registration) -> None:
-        """Whether the robot was carried, or is still where the map says."""
+        """Note that the robot was carried, or is still where the map says."""
         if registered.is_carried:
             self._movers.clear()
             self._path_begin = self.frame.last + 1
@@ -254,10 +254,10 @@ class OnlineSlam:
     def _find_robot(self, scan: PlanarHits | MappedScan, update: Update) -> Update:
         """Search the robot, which is lost; the update with its pose in the map, if it is found."""
         frame, scans = self.frame, len(self.history)
-        found = self._finder.find(self.labels, scan, update.pose, scans, frame, self.odometry)
-        if found is None:
+        place = self._finder.find(self.labels, scan, update.pose, scans, frame, self.odometry)
+        if place is None:
             return update
-        T, motion = found
+        T, motion = place
         self._path_begin = frame.last + 1 if self._place is not None else 0
         self._movers.move(T)
         pose = self.known_frame.to_map(motion @ update.pose)

@@ -237,8 +237,8 @@ class ScanOdometry:
         if not is_poor(match, usual):
             self._weigh_evidence(Evidence.AGREES)
             return match, match.contradicts_odometry, False
-        other = self._guess() if prior.is_odometry else None
-        wider = widen_match(grid, scan, prior, other, match, usual)
+        guess = self._guess() if prior.is_odometry else None
+        wider = widen_match(grid, scan, prior, guess, match, usual)
         # after a scan that contradicted the map, a poor one is where a place only looks alike
         is_sure = not (self._contradictions and is_poor(wider, usual))
         if wider.widened and is_sure and self._is_reachable(beams, wider.T_map_base):
@@ -258,12 +258,12 @@ class ScanOdometry:
     ) -> tuple[ScanMatch, bool, bool]:
         """As of `_match`, after a stretch in which no scan met anything."""
         grid = self.local_map.grid
-        found, evidence = self._reckoning.search(grid, scan, prior, self._pose, usual)
-        if found is not None:
+        match, evidence = self._reckoning.search(grid, scan, prior, self._pose, usual)
+        if match is not None:
             # it was there before, too: the step is that of odometry
-            self._pose = found.T_map_base @ se2.inverse(prior.T_map_base) @ self._pose
+            self._pose = match.T_map_base @ se2.inverse(prior.T_map_base) @ self._pose
             self._contradictions = 0.0
-            return found, False, False
+            return match, False, False
         self._is_adrift = not self._reckoning.is_over
         if not self._is_adrift:  # from here on scans are added to the map again
             self._contradictions = 0.0

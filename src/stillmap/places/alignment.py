@@ -367,13 +367,14 @@ def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> l
     """Those that put the session elsewhere than all better ones, the best first."""
     middle = np.append(middle_of(session), 1.0)
     out = list[Hypothesis]()
-    for one in sorted(hypotheses, key=lambda hypothesis: -hypothesis.comparison.score):
-        distance = [float(np.linalg.norm((one.T - better.T) @ middle)) for better in out]
-        turn = [abs(se2.parameters(se2.inverse(one.T) @ better.T)[2]) for better in out]
+    for hypothesis in sorted(hypotheses, key=lambda each: -each.comparison.score):
+        T = hypothesis.T
+        distance = [float(np.linalg.norm((T - better.T) @ middle)) for better in out]
+        turn = [abs(se2.parameters(se2.inverse(T) @ better.T)[2]) for better in out]
         if not any(
             d < _RIVAL_DISTANCE and a < _RIVAL_ANGLE for d, a in zip(distance, turn, strict=True)
         ):
-            out.append(one)
+            out.append(hypothesis)
     return out
 
 

@@ -262,9 +262,9 @@ def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[Plac
     pairs = []
     for i in gone:
         for j in came:
-            one, other = changes[i], changes[j]
-            if (one.before, one.after) == (other.before, other.after):
-                kind, cost = _compare_positions(one, other, place, bool(hinged & {i, j}))
+            old, new = changes[i], changes[j]
+            if (old.before, old.after) == (new.before, new.after):
+                kind, cost = _compare_positions(old, new, place, bool(hinged & {i, j}))
                 if kind:
                     pairs.append((cost, i, j, kind))
     used, out = set[int](), list[PlaceChange]()

@@ -40,7 +40,7 @@ def fit_leaf(points: Float) -> Leaf | None:
 
 
 def turn_about_hinge(first: Leaf, second: Leaf) -> bool:
-    """Whether two leaves are one in two positions: as long as each other, with a common end."""
+    """True if two leaves are one in two positions: as long as each other, with a common end."""
     apart = np.linalg.norm(first.ends[:, None] - second.ends[None], axis=2)
     i, j = np.unravel_index(int(apart.argmin()), (2, 2))
     u, v = first.ends[1 - i] - first.ends[i], second.ends[1 - j] - second.ends[j]
@@ -52,7 +52,7 @@ def turn_about_hinge(first: Leaf, second: Leaf) -> bool:
 
 
 def is_hinged(leaf: Leaf, wall: Float) -> bool:
-    """Whether a leaf ends where a wall does, beside a gap that it could shut.
+    """True if a leaf ends where a wall does, beside a gap that it could shut.
 
     Args:
         leaf: what is seen of it.
@@ -73,7 +73,7 @@ def is_hinged(leaf: Leaf, wall: Float) -> bool:
 
 
 def _is_gap(end: Float, angle: float, length: float, wall: Float) -> bool:
-    """Whether a wall ends near a point and goes on in a direction, a leaf's width away."""
+    """True if a wall ends near a point and goes on in a direction, a leaf's width away."""
     u = np.array([np.cos(angle), np.sin(angle)])
     offset = wall - end
     along, across = offset @ u, offset @ [-u[1], u[0]]
@@ -90,6 +90,6 @@ def _is_gap(end: Float, angle: float, length: float, wall: Float) -> bool:
 
 
 def _covers(depth: Float) -> bool:
-    """Whether points at depths (n,) in a wall, metres, fill its first part."""
+    """True if points at depths (n,) in a wall, metres, fill its first part."""
     filled = np.unique(np.floor(depth[depth < _POST] / _STEP))
     return len(filled) >= 0.75 * _POST / _STEP

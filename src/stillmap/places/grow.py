@@ -177,7 +177,7 @@ def _differing_share(place: Place) -> float:
 def _beats_rivals(
     place: Place, session: Session, placement: Placement, matches: Matches, threads: int
 ) -> bool:
-    """Whether an alignment, with these matches, leaves far less unexplained than others do."""
+    """True if an alignment, with these matches, leaves far less unexplained than others do."""
     unexplained = _unexplained_share(matches)
     if unexplained > _MAX_UNEXPLAINED:
         return False
@@ -285,7 +285,7 @@ def _optimize(place: Place, placed: PlacedSession, ties: list[Tie]) -> tuple[Pla
 def _describe(place: Place, ties: list[Tie]) -> Place:
     """The place with covariance and overlap of its last session."""
     *before, placed = place.sessions
-    planar = [one.require_evidence()[1] for one in place.sessions]
+    planar = [each.require_evidence()[1] for each in place.sessions]
     last = replace(
         placed,
         covariance=estimate_covariance(placed, ties),

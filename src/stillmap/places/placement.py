@@ -42,7 +42,7 @@ _INDEPENDENT = 0.3  # share of a match that is evidence of its own: neighbours s
 
 @dataclass(frozen=True, eq=False)
 class Placement(ShortRepr):
-    """Where a session lies in a place, or why that is not known.
+    """Alignment of a session with a place, or why that is not known.
 
     Attributes:
         T: (3, 3) T_place_session in the plane.
@@ -63,7 +63,7 @@ class Placement(ShortRepr):
 
 
 def find_placement(place: Sequence[PlacedSession], session: Session) -> Placement:
-    """Where a session lies in a place.
+    """Find the alignment of a session with a place.
 
     Args:
         place: its sessions, at least one, with evidence.
@@ -91,7 +91,7 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
 
 
 def _is_strong(proposed: list[Hypothesis]) -> bool:
-    """Whether the comparison of the maps alone is enough."""
+    """True if the comparison of the maps alone is enough."""
     best = proposed[0].comparison
     rival = max((hypothesis.comparison.score for hypothesis in proposed[1:]), default=0.0)
     few = best.conflict <= _STRONG_CONFLICT * (best.agree + best.conflict)
@@ -99,7 +99,7 @@ def _is_strong(proposed: list[Hypothesis]) -> bool:
 
 
 def _is_excluded(proposed: list[Hypothesis]) -> bool:
-    """Whether the maps exclude even the best alignment."""
+    """True if the maps exclude even the best alignment."""
     if not proposed or proposed[0].comparison.agree < _MIN_AGREEING:
         return True
     best = proposed[0].comparison

@@ -1,4 +1,4 @@
-"""What a place keeps: `sessions/NAME/` is enough to merge further ones without the recording.
+"""Files of a place: `sessions/NAME/` is enough to merge further ones without the recording.
 
 `state/` holds flat arrays, the keyframes as recording folders, and evidence; `ties.npz` of the
 place the constraints between sessions.

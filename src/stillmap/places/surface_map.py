@@ -67,7 +67,7 @@ class SurfaceMap(ShortRepr):
     edge: float
 
     def look_up(self, points: Float, sides: Float) -> Comparison:
-        """How many surfaces lie near a surface with the same free side, and in free space.
+        """Count surfaces near a surface with the same free side, and in free space.
 
         Rooms that look alike fit on the other face of a wall, too.
 
@@ -184,7 +184,7 @@ def compare_surfaces(
 
 
 def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> bool:
-    """Whether the maps agree less wherever else the session is shifted to by a few decimetres.
+    """True if the maps agree less wherever else the session is shifted to by a few decimetres.
 
     Along a bare corridor they agree as much.
     """

@@ -84,27 +84,27 @@ class ScanViews:
         profiles = _polar_profiles(ranges, bearings, sectors)
         return cls(points, hit, ranges, bearings, *profiles, T_map_sensor[scans])
 
-    def compare(self, scan: Index, beams: Index, other: Index) -> NDArray[np.int8]:
+    def compare(self, scan: Index, beams: Index, reference: Index) -> NDArray[np.int8]:
         """(K, R, N) how beams of R other scans relate to the end points of N beams of K scans.
 
         Args:
             scan: (K,) the scans.
             beams: (N,) beams of all of them.
-            other: (K, R) scans to compare with; -1: none, nothing is known.
+            reference: (K, R) scans to compare with; -1: none, nothing is known.
         """
-        T = se2.inverse(self.T_map_sensor[other]) @ self.T_map_sensor[scan][:, None]
+        T = se2.inverse(self.T_map_sensor[reference]) @ self.T_map_sensor[scan][:, None]
         c, s, tx, ty = (T[..., i, j, None] for i, j in ((0, 0), (1, 0), (0, 2), (1, 2)))
         x, y = np.moveaxis(self.points[scan[:, None], beams], -1, 0)[:, :, None]
         u, v = c * x - s * y + tx, s * x + c * y + ty
         r, sectors = np.hypot(u, v), self.nearest.shape[1]
         with np.errstate(invalid="ignore"):  # NaN becomes some sector
             sector = (np.arctan2(v, u) * (sectors / (2.0 * np.pi)) + sectors).astype(np.int64)
-            cell = other[:, :, None] * sectors + sector % sectors
+            cell = reference[:, :, None] * sectors + sector % sectors
             near, far = self.nearest.take(cell), self.farthest.take(cell)
             margin = _MARGIN + _MARGIN_SHARE * r
             relation = np.where(far < r - margin, np.int8(SHORTER), np.int8(AGREED))
             relation[near > r + margin] = PASSED
-            relation[~(near > 0.0) | ~np.isfinite(r) | (other < 0)[:, :, None]] = 0
+            relation[~(near > 0.0) | ~np.isfinite(r) | (reference < 0)[:, :, None]] = 0
         return relation
 
 
@@ -131,7 +131,7 @@ def find_floor_returns(recording: Recording, poses: Float) -> Bool:
         poses: (T, 3, 3) of the base in a common frame; they have to be right over a few seconds
             only, such as odometry.
     """
-    found = np.zeros(recording.n_beams, np.bool_)
+    mask = np.zeros(recording.n_beams, np.bool_)
     T_map_sensor = recording.T_map_sensor(poses)
     seconds = np.asarray(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]), np.float64)
     for sensor in range(len(recording.T_base_sensor)):
@@ -145,8 +145,8 @@ def find_floor_returns(recording: Recording, poses: Float) -> Bool:
         step = max(1, _CHUNK_BEAMS // max(widest, 1))
         for first in range(0, len(scans), step):
             own = np.arange(first, min(first + step, len(scans)))
-            _find_in_chunk(recording, scans, T_map_sensor, references, own, found)
-    return found
+            _find_in_chunk(recording, scans, T_map_sensor, references, own, mask)
+    return mask
 
 
 def _reference_scans(seconds: Float, T_map_sensor: Float, side: int) -> NDArray[np.int64]:
@@ -160,15 +160,15 @@ def _reference_scans(seconds: Float, T_map_sensor: Float, side: int) -> NDArray[
         scan = np.where(nearer, late - 1, late)
         late_by = np.abs(seconds[scan] - wanted)
         columns.append(np.where(late_by <= _MAX_LATE, scan, number + side * min(k, _NEAREST)))
-    found = np.stack(columns, axis=1)
-    found[(found < 0) | (found >= T) | (side * (found - number[:, None]) <= 0)] = -1
-    for k in range(1, found.shape[1]):  # each scan once
-        found[(found[:, k : k + 1] == found[:, :k]).any(axis=1), k] = -1
+    chosen = np.stack(columns, axis=1)
+    chosen[(chosen < 0) | (chosen >= T) | (side * (chosen - number[:, None]) <= 0)] = -1
+    for k in range(1, chosen.shape[1]):  # each scan once
+        chosen[(chosen[:, k : k + 1] == chosen[:, :k]).any(axis=1), k] = -1
     x, y, theta = se2.parameters(T_map_sensor).T
-    travel = np.hypot(x[found] - x[:, None], y[found] - y[:, None])
-    turn = np.abs(se2.wrap(theta[found] - theta[:, None]))
-    found[(travel > _MAX_TRAVEL) | (turn > _MAX_TURN)] = -1
-    return found
+    travel = np.hypot(x[chosen] - x[:, None], y[chosen] - y[:, None])
+    turn = np.abs(se2.wrap(theta[chosen] - theta[:, None]))
+    chosen[(travel > _MAX_TRAVEL) | (turn > _MAX_TURN)] = -1
+    return chosen
 
 
 def _find_in_chunk(
@@ -177,7 +177,7 @@ def _find_in_chunk(
     T_map_sensor: Float,
     references: NDArray[np.int64],
     own: Index,
-    found: Bool,
+    mask: Bool,
 ) -> None:
     """Marks floor returns of some scans of a sensor.
 
@@ -187,7 +187,7 @@ def _find_in_chunk(
         T_map_sensor: (T, 3, 3) of all scans.
         references: (S, 2R) of these scans before and after each.
         own: consecutive ones of the scans.
-        found: (M,) mask to add to.
+        mask: (M,) to add to.
     """
     use = references[own]
     first = min(int(own[0]), int(use.min(where=use >= 0, initial=own[0])))
@@ -198,7 +198,7 @@ def _find_in_chunk(
         floor = _find_in_scan(views, int(own[k]), references[k])
         if floor is not None:
             beams = recording.beams_of(int(scans[first + own[k]]))
-            found[beams][floor[: beams.stop - beams.start]] = True
+            mask[beams][floor[: beams.stop - beams.start]] = True
 
 
 def _select_scans(views: ScanViews, own: Index, references: NDArray[np.int64]) -> Index:

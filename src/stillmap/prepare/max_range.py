@@ -67,12 +67,12 @@ def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -
     if declared is not None and not 0.0 < declared < MAX_PLAUSIBLE_RANGE:
         declared = None
     real = ranges[(ranges >= MAX_ZERO_RANGE) & (ranges < MAX_PLAUSIBLE_RANGE)]
-    found = _find_code(ranges, real) if real.size else None
-    if declared is not None and (found is None or declared < found[0]):
-        also = f"; {found[1]}" if found else ""
-        return MaxRange(declared, f"{DECLARED}{also}", found is not None)
-    if found is not None:
-        return MaxRange(found[0], found[1], True)
+    code = _find_code(ranges, real) if real.size else None
+    if declared is not None and (code is None or declared < code[0]):
+        also = f"; {code[1]}" if code else ""
+        return MaxRange(declared, f"{DECLARED}{also}", code is not None)
+    if code is not None:
+        return MaxRange(code[0], code[1], True)
     if np.any(ranges >= MAX_PLAUSIBLE_RANGE):
         return MaxRange(None, "only infinite readings", False)
     return MaxRange(None, "no code among the readings and none declared", False)
@@ -132,18 +132,18 @@ def infer_range_rule(
     ranges: NDArray[np.float32], declared: float | None, options: ReadOptions
 ) -> tuple[RangeRule, list[str]]:
     """Infer the rule for the readings (T, n) of one laser, and warnings."""
-    found = find_max_range(ranges, declared)
-    threshold, how, warnings = found.threshold, found.how, []
+    limit = find_max_range(ranges, declared)
+    threshold, how, warnings = limit.threshold, limit.how, []
     if options.max_range is not None:
         threshold, how = options.max_range, GIVEN
-        if found.coded and found.threshold is not None and found.threshold < options.max_range:
+        if limit.coded and limit.threshold is not None and limit.threshold < options.max_range:
             warnings.append(
                 f"max_range {options.max_range:g} m exceeds a likely maximum-range code "
-                f"({found.how}), whose readings count as hits"
+                f"({limit.how}), whose readings count as hits"
             )
     no_return = ranges >= np.float32(MAX_PLAUSIBLE_RANGE if threshold is None else threshold)
     coded = (
-        found.coded
+        limit.coded
         or bool(np.any(ranges >= MAX_PLAUSIBLE_RANGE))
         or no_return.mean() > MIN_ZERO_SHARE
     )
@@ -181,8 +181,8 @@ def _zero_meaning(
     if no_return_share > 0.0 and share <= MIN_ZERO_RATIO * no_return_share:
         return "unusable", f"{text}; no return has its own value"
     if share > MIN_ZERO_SHARE:
-        other = "hardly any other" if no_return_share > 0.0 else "no other"
-        return "max-range", f"{text} and {other} value stands for no return"
+        rest = "hardly any other" if no_return_share > 0.0 else "no other"
+        return "max-range", f"{text} and {rest} value stands for no return"
     return "unusable", text
 
 

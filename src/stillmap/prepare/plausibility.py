@@ -1,4 +1,4 @@
-"""What no map holds and no robot does: beams that are too long, leaps, far poses, late odometry.
+"""Removal of what cannot be: beams that are too long, leaps, far poses, late odometry.
 
 Beams that are too long take time and memory in proportion to the cells that they cross, and few of
 them lie close enough together to show a surface.
@@ -115,11 +115,11 @@ def shorten_far_beams(
 
 def _find_far(recording: Recording, reach: float) -> NDArray[np.intp]:
     """Beams longer than `reach` m."""
-    found = [np.zeros(0, np.intp)]
+    far = [np.zeros(0, np.intp)]
     for block in arrays.iter_blocks(recording.points):
         squared = arrays.squared_lengths(recording.points[block])
-        found.append(np.flatnonzero(squared > reach * reach) + block.start)
-    return np.concatenate(found)
+        far.append(np.flatnonzero(squared > reach * reach) + block.start)
+    return np.concatenate(far)
 
 
 def _longest_return(recording: Recording) -> float:
@@ -201,10 +201,10 @@ def leave_out_far_scans(
     for t in far.tolist():
         beams = recording.beams_of(t)
         points[beams], hit[beams] = np.nan, False
-    one, places = far[0], poses[far[0], :2, -1]
+    first, places = far[0], poses[far[0], :2, -1]
     sentence = advise(
         f"{len(far)} scan{'s are' if len(far) > 1 else ' is'} farther than {reach / 1e3:g} km from "
-        f"most others by the given poses, first scan {one} at ({places[0]:.7g}, {places[1]:.7g}) "
+        f"most others by the given poses, first scan {first} at ({places[0]:.7g}, {places[1]:.7g}) "
         "m: the beams are not used",
         "correct these poses",
     )

@@ -32,8 +32,8 @@ def prepare(
 
 
 def interpret(raw: Recording | RawLasers, options: ReadOptions, scratch: Path | None) -> Recording:
-    """Which readings are hits, by the range rule of planar lasers or by the limits of ranges; poses
-    of lasers that options give.
+    """The recording, its hits by the range rule of planar lasers or by the limits of ranges, with
+    poses of lasers that options give.
 
     Raises:
         InputError: a laser pose is given for a 3D recording or a laser that does not exist.
@@ -48,7 +48,7 @@ def interpret(raw: Recording | RawLasers, options: ReadOptions, scratch: Path | 
 
 
 def complete(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
-    """What follows from all scans of a recording; nothing in 2D, where the range rule saw to it.
+    """Add what follows from all scans: in 2D nothing, where the range rule saw to it.
 
     Raises:
         InputError: options are for recordings of another dimension.

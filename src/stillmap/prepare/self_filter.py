@@ -79,19 +79,19 @@ def remove_self_returns(recording: Recording) -> Recording:
         recording: 3D. Returned unchanged where no returns from the robot are found.
     """
     masks = {k: find_self_mask(recording, k) for k in range(len(recording.T_base_sensor))}
-    found = {k: mask for k, mask in masks.items() if mask is not None}
-    if not found:
+    known = {k: mask for k, mask in masks.items() if mask is not None}
+    if not known:
         return recording
     points = arrays.copy(recording.points, recording.scratch)
     hit = arrays.copy(recording.hit, recording.scratch)
-    counts = dict.fromkeys(found, 0)
+    counts = dict.fromkeys(known, 0)
     for scan in recording.iter_scans(range(recording.n_scans), points, hit):
         sensor, beams = int(recording.sensor[scan]), recording.beams_of(scan)
-        if sensor in found:
-            removed = beams.start + found[sensor].find_self_returns(points[beams], hit[beams])
+        if sensor in known:
+            removed = beams.start + known[sensor].find_self_returns(points[beams], hit[beams])
             points[removed], hit[removed] = np.nan, False
             counts[sensor] += len(removed)
-    boxes = [BodyBox(k, counts[k], *_bounding_box(mask.cells)) for k, mask in found.items()]
+    boxes = [BodyBox(k, counts[k], *_bounding_box(mask.cells)) for k, mask in known.items()]
     source = replace(recording.source, self_filter=boxes)
     return replace(recording, points=points, hit=hit, source=source)
 

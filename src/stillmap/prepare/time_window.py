@@ -108,7 +108,7 @@ class TimeWindow:
 
     @property
     def part(self) -> Part | None:
-        """What was read, as `Recording.source` notes it; None without limits."""
+        """The part that was read, as `Recording.source` notes it; None without limits."""
         if not self or self.first_ns is None:
             return None
         return Part(

@@ -1,4 +1,4 @@
-"""What stands where, session after session: furniture, parked cars, doors."""
+"""Layout of a world, session after session: furniture, parked cars, doors."""
 
 import math
 from collections.abc import Sequence
@@ -308,13 +308,13 @@ class Layout:
         faces = [item.faces_in(-1) for item in self.objects if item is not without]
         return np.concatenate([np.empty((0, 4)), *faces])
 
-    def _draw_angle(self, door: Door, other: Place | None = None) -> Place:
-        """A door with a direction of its leaf; `other`: not with that."""
+    def _draw_angle(self, door: Door, former: Place | None = None) -> Place:
+        """A door with a direction of its leaf; `former`: not with that."""
         while True:
             is_closed = self._rng.random() < _CLOSED_DOORS
             share = 0.0 if is_closed else float(self._rng.uniform(_MIN_OPEN, 1.0))
             angle = door.closed + share * (door.opened - door.closed)
-            if other is None or abs(angle - other.yaw) > _MIN_TURN:
+            if former is None or abs(angle - former.yaw) > _MIN_TURN:
                 return Place(*door.hinge, angle)
 
 

@@ -290,7 +290,7 @@ def _median_offset(poses: Float) -> tuple[Float, bool]:
 
 
 def _find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> tuple[bool, str]:
-    """Whether a laser is mounted upside down, its beams turning clockwise, and the source.
+    """True if a laser is mounted upside down, its beams turning clockwise, and the source.
 
     CARMEN's own laser_..._flipped does not tell: its laser server reverses such readings before
     they are logged.

@@ -185,7 +185,7 @@ def _iter_blocks(library: Any, file: Any, node: Any, path: Path) -> Iterator[Col
     """
     prototype = library.StructureNode(node["points"].prototype())
     named = (_CARTESIAN, "cartesianInvalidState"), (_SPHERICAL, "sphericalInvalidState")
-    usable = [one for one in named if all(prototype.isDefined(name) for name in one[0])]
+    usable = [form for form in named if all(prototype.isDefined(name) for name in form[0])]
     if not usable:
         raise InputError("holds a scan without coordinates", where=str(path))
     names, state = usable[0]

@@ -91,7 +91,7 @@ def _parse_header(path: Path, lines: list[list[str]], header: int) -> TableLayou
         if len(plain) < len(fields) and (name == "vertex" or not text):
             raise ValueError("its vertices have list properties, or follow such")
         if name == "vertex":
-            indexed = any(count > 0 for other, count, _ in elements if other != name)
+            indexed = any(count > 0 for element, count, _ in elements if element != name)
             return TableLayout(path, plain, rows, header, start, before, text, ordered=indexed)
         start += rows * sum(field.size for field in plain)
         before += rows

@@ -96,8 +96,8 @@ class ImageCollector:
 
     def _camera(self, topic: str, tree: TransformTree, base: str) -> Camera:
         info = self._infos.get(f"{_camera_name(topic)}/camera_info")
-        found = tree.lookup(base, self._frames[topic], np.zeros(1, np.int64))
-        T = None if found is None or found.moves else found.T[0]
+        transforms = tree.lookup(base, self._frames[topic], np.zeros(1, np.int64))
+        T = None if transforms is None or transforms.moves else transforms.T[0]
         if info is None:
             return Camera(topic, 0, 0, None, "", _NONE, T)
         camera = Camera(topic, int(info.width), int(info.height), None, "", _NONE, T)

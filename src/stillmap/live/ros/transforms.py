@@ -24,7 +24,7 @@ _MESSAGES, _ROBOT = "odometry", "robot"  # frames of Odometry messages in a buff
 
 
 class Transforms:
-    """What TF and Odometry messages have said in the last seconds.
+    """Transforms of TF and Odometry messages of the last seconds.
 
     The source of odometry that is first able to give a pose is kept: two of them may differ by any
     offset.
@@ -91,7 +91,7 @@ class Transforms:
         return max(of_tf, _last_ns(self._messages, _MESSAGES, _ROBOT))
 
     def find_mount(self, topic: str, frame: str, stamp: int) -> Mount | None:
-        """Where a sensor is on the robot: by a parameter, else by TF; None: it is not known."""
+        """Pose of a sensor on the robot: by a parameter, else by TF; None: it is not known."""
         names = self._parameters
         if names.laser_pose:
             return self._given_mount(names.topics.index(topic))
