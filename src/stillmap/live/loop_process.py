@@ -114,7 +114,8 @@ class LoopProcess:
             messages = receive(stdout)
             for correction, count in messages:
                 near = list(itertools.islice(messages, count))
-                self._incoming.append(replace(correction, near=near))
+                if len(near) == count:  # else the process has ended amid them
+                    self._incoming.append(replace(correction, near=near))
 
 
 def start_closer(
