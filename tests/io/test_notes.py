@@ -31,3 +31,17 @@ def test_notes_of_our_readers_stay(tmp_path, reader):
 @pytest.mark.parametrize("source", [None, [], 3, "x", {"sensors": 1, "warnings": [1], "path": {}}])
 def test_notes_of_others(source):
     assert Source.from_dict(source) == Source()
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {"beams_per_scan": -(10**40), "start_angle": 0.0, "angle_step": 0.1},
+        {"beams_per_scan": 3, "start_angle": 1e308, "angle_step": 1e308},
+        {"places": -1},
+        {"grid": [-1, -1]},
+        {"scans": 10**400},
+    ],
+)
+def test_numbers_that_cannot_be(sensor):
+    assert Source.from_dict({"path": "a", "sensors": [sensor]}) == Source("a")

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.json import to_jsonable
+
+# of notes in a file, which may hold anything: no sum and no angle in degrees overflows
+Count = Annotated[int, Ge(0), Le(2**53)]
+Stamp = Annotated[int, Ge(-(2**63)), Le(2**63 - 1)]
+Angle = Annotated[float, Ge(-1e3), Le(1e3)]
 
 
 @dataclass(frozen=True)
@@ -58,14 +64,14 @@ class SensorNotes:
 
     name: str = ""
     frame: str | None = None
-    scans: int | None = None
-    places: int = 1
-    beams_per_scan: int | None = None
-    start_angle: float | None = None
-    angle_step: float | None = None
+    scans: Count | None = None
+    places: Annotated[int, Ge(1), Le(2**53)] = 1
+    beams_per_scan: Count | None = None
+    start_angle: Angle | None = None
+    angle_step: Angle | None = None
     upside_down: bool | None = None
     upside_down_how: str | None = None
-    grid: tuple[int, int] | None = None
+    grid: tuple[Count, Count] | None = None
     extrinsics: LaserPose | None = None
     ranges: RangeRule | None = None
 
@@ -74,19 +80,19 @@ class SensorNotes:
 class Skipped:
     """Records that were skipped for one reason: their count, and the numbers of the first."""
 
-    count: int
-    lines: list[int] = field(default_factory=list)
+    count: Count
+    lines: list[Count] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Part:
     """Part of a run, or of the time of a recording (`start`, `end` in seconds as given)."""
 
-    first_stamp_ns: int | None = None
-    last_stamp_ns: int | None = None
+    first_stamp_ns: Stamp | None = None
+    last_stamp_ns: Stamp | None = None
     path: str | None = None
-    scans: int | None = None
-    omitted: int = 0
+    scans: Count | None = None
+    omitted: Count = 0
     start: float | None = None
     end: float | None = None
 
@@ -95,8 +101,8 @@ class Part:
 class BodyBox:
     """Box around a sensor, in metres, with the returns from the robot itself."""
 
-    sensor: int
-    beams: int
+    sensor: Count
+    beams: Count
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
