@@ -250,7 +250,7 @@ def _weigh(keyframes: Keyframes, poses: Float, states: PlaceStates | None) -> Ke
 def make_ties(matches: Matches, index: int) -> list[Tie]:
     """The constraints of keyframes that fit, between references and session `index`."""
     return [
-        Tie(reference, match.other, index, match.node, match.closure.T, match.closure.covariance)
+        Tie(reference, match.nearest, index, match.node, match.closure.T, match.closure.covariance)
         for reference, of in matches.items()
         for match in of
         if match.verdict is Verdict.FITS

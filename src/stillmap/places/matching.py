@@ -44,13 +44,13 @@ class KeyframeMatch(NamedTuple):
     """A keyframe matched with a submap of another session.
 
     Attributes:
-        node, other: indices into the nodes of the two sessions.
+        node, nearest: indices into the nodes of the session and of the other one.
         closure: the measured pose of the keyframe in the frame of the other node.
         verdict: see Verdict.
     """
 
     node: int
-    other: int
+    nearest: int
     closure: LoopClosure
     verdict: Verdict
 
@@ -77,14 +77,16 @@ def match_sessions(
     K = len(reference)
     pairs = list(_pair_nodes(context, len(reference.nodes), nodes))
     by_stretch: dict[int, list[tuple[int, int]]] = {}
-    for node, other in pairs:
-        at = context.travelled[reference.nodes[other]]
-        by_stretch.setdefault(round(at / loop_verification.SUBMAP_TRAVEL), []).append((node, other))
+    for node, nearest in pairs:
+        at = context.travelled[reference.nodes[nearest]]
+        by_stretch.setdefault(round(at / loop_verification.SUBMAP_TRAVEL), []).append(
+            (node, nearest)
+        )
     out = []
     for stretch, members in sorted(by_stretch.items()):
         submap = loop_verification.build_submap(context, stretch * loop_verification.SUBMAP_TRAVEL)
-        for node, other in members:
-            earlier, later = int(reference.nodes[other]), K + int(session.nodes[node])
+        for node, nearest in members:
+            earlier, later = int(reference.nodes[nearest]), K + int(session.nodes[node])
             T = se2.inverse(context.poses[earlier]) @ context.poses[later]
             closure = loop_verification.verify_candidate(
                 context, submap, LoopCandidate(earlier, later, T, 0.0), *std, _FITS
@@ -92,7 +94,7 @@ def match_sessions(
             occluded = scan_matching.occluded_share(
                 submap, context.hits(later), context.poses[earlier] @ closure.T
             )
-            out.append(_judge(node, other, closure, occluded))
+            out.append(_judge(node, nearest, closure, occluded))
     return sorted(out, key=lambda match: match.node)
 
 
@@ -139,20 +141,20 @@ def _pair_nodes(
             (distance + turn, distance, REACH),
             (view_distance, view_distance, _VIEW_REACH),
         ):
-            other = int(np.argmin(cost))
-            if off[other] <= reach:
-                yield node, other
+            nearest = int(np.argmin(cost))
+            if off[nearest] <= reach:
+                yield node, nearest
                 break
 
 
-def _judge(node: int, other: int, closure: LoopClosure, occluded: float) -> KeyframeMatch:
+def _judge(node: int, nearest: int, closure: LoopClosure, occluded: float) -> KeyframeMatch:
     verdict = Verdict.UNKNOWN
     if closure.comparable >= loop_verification.MIN_COMPARABLE:
         if occluded > scan_matching.MAX_OCCLUDED or closure.explained < _CONTRADICTS:
             verdict = Verdict.CONTRADICTS
         elif not closure.rejected:
             verdict = Verdict.FITS
-    return KeyframeMatch(node, other, closure, verdict)
+    return KeyframeMatch(node, nearest, closure, verdict)
 
 
 _REACH = 20.0  # m between a node and the one of the other session whose submap it is matched with

@@ -250,7 +250,7 @@ class LiveNode:
             "latency 99 % (ms)": f"{np.quantile(ms, 0.99):.1f}",
             "odometry": self._transforms.source or "none",
             **{reason: str(n) for reason, n in sorted(counts.items())},
-            **{DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
+            **{DOUBTS[name]: str(n) for name, n in sorted(doubts.items())},
         }
         level, text = DiagnosticStatus.OK, "mapping" if self.scans else "waiting for scans"
         if new or doubts:
