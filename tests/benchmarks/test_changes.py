@@ -9,6 +9,9 @@ from changes import COLUMNS, beams_of, scores_of, stays_of
 
 from stillmap.sim import Simulation, scene_by_name, simulate
 
+# whole simulations are scored
+pytestmark = pytest.mark.slow
+
 SHORT = {"robot": {"scans": 1000}}
 
 
@@ -18,7 +21,6 @@ def street() -> Simulation:
     return simulate(scene_by_name("street-moved", SHORT), 0)
 
 
-@pytest.mark.slow
 def test_stays_are_those_of_the_things(street: Simulation) -> None:
     stays = stays_of(street)
     kinds = street.truth.scene["mover_kinds"]

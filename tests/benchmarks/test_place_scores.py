@@ -16,6 +16,9 @@ from stillmap.core.errors import InputError
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import plan_sessions, write_sessions
 
+# whole simulations are scored
+pytestmark = pytest.mark.slow
+
 QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2}}
 
 
@@ -73,7 +76,6 @@ def test_a_perfect_place_is_perfect(perfect: Path, truth: SessionTruth) -> None:
     assert own.wall_cells > 500
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shift", "verdict"),
     [
@@ -100,7 +102,6 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
         assert one.median_seam == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
 
 
-@pytest.mark.slow
 def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
     scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
     plans = [plan_sessions(scene, 1, k) for k, scene in enumerate(scenes)]

@@ -11,6 +11,9 @@ from place_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import draw_piece, plan_sessions, write_sessions
 
+# whole simulations are scored
+pytestmark = pytest.mark.slow
+
 SWEEPS = {"lidar": {"channels": 12, "columns": 120}, "robot": {"scans": 12}}
 SESSIONS = [0, 1, 2]
 

@@ -21,7 +21,7 @@ def folder(tmp_path) -> Path:
     return tmp_path / NAME
 
 
-def test_names_that_are_no_utf8(stillmap, room, folder):
+def test_names_that_are_no_utf8(stillmap, call, room, folder):
     recording, out = folder / f"{NAME}-in", folder / f"{NAME}-out"
     shutil.copytree(room, recording)
     done = stillmap("map", recording, "-o", out, "--quiet", "--json", *QUICK)
@@ -33,11 +33,11 @@ def test_names_that_are_no_utf8(stillmap, room, folder):
     )
     assert r"\udce4" in (out / "report.html").read_text(encoding="utf-8")
     for target in ("clean", "clean.log", "clean.mcap"):  # which finds the recording by run.json
-        done = stillmap("filter", out, "-o", folder / f"{NAME}{target}", "--quiet")
+        done = call("filter", out, "-o", folder / f"{NAME}{target}", "--quiet")
         assert (done.returncode, done.stderr) == (0, "")
     for target in ("beams.parquet", "a.bag", "a.mcap"):
         pytest.importorskip("pyarrow")
-        done = stillmap("convert", out, "-o", folder / f"{NAME}{target}", "--quiet")
+        done = call("convert", out, "-o", folder / f"{NAME}{target}", "--quiet")
         assert (done.returncode, done.stderr) == (0, "")
 
 

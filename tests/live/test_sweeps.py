@@ -55,6 +55,7 @@ def test_threads_change_nothing():
         run.mapper.close()
 
 
+@pytest.mark.slow
 def test_saves_what_map_writes(sweeps, tmp_path):
     sweeps.mapper.save(tmp_path / "out")
     result = stillmap.load(tmp_path / "out")
