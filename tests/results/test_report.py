@@ -138,7 +138,7 @@ def test_quality_in_figures_and_words(result, section):
         line = getattr(words, name.lower()).partition(": ")[2]
         assert f"{name} {figure} of 100 {line}." in text
     text = " ".join(Page(section(render_report(result), "Quality")).text)
-    assert text.count("cannot be told from this recording.") == 3
+    assert text.count("cannot be determined from this recording.") == 3
     assert "of 100" not in text
 
 

@@ -39,8 +39,8 @@ def _escape(match: re.Match[str]) -> str:
 
 
 def install_command(group: str) -> str:
-    """The pip command that adds an extra, also to an installation from a clone."""
-    return f"pip install 'stillmap[{group}]', in a clone pip install '.[{group}]'"
+    """The pip command that adds an extra; the package is on no index, so it names the clone."""
+    return f"in a clone of stillmap: pip install '.[{group}]'"
 
 
 _MAX_LENGTH = 1000  # characters of a message: damaged files may hold long words

@@ -60,11 +60,11 @@ class QualityEvidence:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of a result, each from 0 (useless) to 100; None where it cannot be told.
+    """Quality of a result, each from 0 (useless) to 100; None where it cannot be determined.
 
     Attributes:
         overall: geometric mean of both parts, geometry with three quarters of the weight; geometry
-            alone where labels cannot be told.
+            alone where labels cannot be determined.
         labels: of P(static); None where hardly anything moves.
         geometry: of poses and map.
         evidence: see QualityEvidence; unknown of results that were read from a folder.
@@ -183,7 +183,7 @@ def describe_quality(quality: Quality) -> QualityText:
         labels = _line("labels", quality.labels, _LABELS)
         overall = _line("overall", quality.overall, _GEOMETRY)
         if quality.geometry is not None:
-            labels = "labels: cannot be told, as hardly anything moves"
+            labels = "labels: cannot be determined, as hardly anything moves"
         return QualityText(overall, labels, geometry)
     most = min(quality.labels, quality.geometry) + _MAX_CONTRAST
     overall = _line("overall", quality.overall, _OVERALL, most)
@@ -219,6 +219,6 @@ def _line(
 ) -> str:
     """The sentence of a value, or of `most` where the value is larger."""
     if value is None:
-        return f"{name}: cannot be told from this recording"
+        return f"{name}: cannot be determined from this recording"
     sentence = next(text for lowest, text in sentences if min(value, most) >= lowest)
     return f"{name} {value:.0f} of 100: {sentence}"

@@ -132,7 +132,7 @@ class MappedPlace:
 
     @property
     def quality(self) -> Quality:
-        """Of labels and geometry, from 0 to 100; None where it cannot be told."""
+        """Of labels and geometry, from 0 to 100; None where it cannot be determined."""
         return self.loaded.quality if self.mapping is None else self.mapping.quality
 
     @property

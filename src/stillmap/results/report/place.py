@@ -42,7 +42,7 @@ _WORDS = {
     "appeared": ("appeared", "appeared"),
     "gone": ("gone", "gone"),
     "moved": ("moved", "moved"),
-    "door": ("door otherwise", "doors otherwise"),
+    "door": ("door swung", "doors swung"),
 }
 _FILES = {
     "sessions.json": "the sessions, and where each lies in the place",

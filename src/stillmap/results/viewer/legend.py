@@ -75,7 +75,7 @@ _CHANGES = {
     "appeared": ("solid", "A: appeared"),
     "gone": ("dashed", "G: gone"),
     "moved": ("solid", "M: moved, dotted where from"),
-    "door": ("dotted", "D: door, otherwise than before"),
+    "door": ("dotted", "D: door swung"),
 }
 
 
