@@ -151,7 +151,9 @@ def test_of_one_scan_nothing_can_be_told(run):
     quality = rate_quality(recording, np.eye(3)[None], p_static, occupancy)
     assert quality.geometry is None
     assert quality.overall is None
-    assert describe_quality(quality).geometry == "geometry: cannot be determined from this recording"
+    assert (
+        describe_quality(quality).geometry == "geometry: cannot be determined from this recording"
+    )
 
 
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio"])
