@@ -147,7 +147,7 @@ def _run_data(result: MappingResult) -> dict[str, Any]:
 
 
 def _quality_data(result: MappingResult) -> list[tuple[str, float | None, str]]:
-    """Each part of the quality: its name, from 0 to 100 None where unknown, words."""
+    """Each part of the quality: its name, from 0 to 100 (None: unknown), and words."""
     quality, words = result.quality, describe_quality(result.quality)
     return [
         ("Overall", quality.overall, _sentence_of(words.overall)),
