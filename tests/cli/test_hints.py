@@ -153,4 +153,4 @@ def test_every_command_has_a_call():
 def test_missing_extra_names_the_command_that_adds_it(group):
     with pytest.raises(MissingExtra, match="needs absent_library to be read") as caught:
         import_extra("absent_library.part", "some.file", group=group)
-    assert f"pip install 'stillmap[{group}]'" in caught.value.hint
+    assert f"pip install '.[{group}]'" in caught.value.hint
