@@ -236,16 +236,16 @@ def _find_jump(before: Recording, after: Recording, A: Float, B: Float) -> str:
     """The gap between the poses of one part and the one before; "" where they go on."""
     step = _measure_motions(A[-1:], B[:1])[0]
     seconds = abs(int(after.stamp_ns[0]) - int(before.stamp_ns[-1])) / 1e9 + _SLACK
-    usual = np.maximum(_usual_speed(before, A), _usual_speed(after, B))
-    reach = np.maximum(_SPEED_FACTOR * usual, 1.0) * seconds + _ROUNDING
+    fast = np.maximum(_quantile_speed(before, A), _quantile_speed(after, B))
+    reach = np.maximum(_SPEED_FACTOR * fast, 1.0) * seconds + _ROUNDING
     starts_anew = np.allclose(B[0], np.eye(len(B[0]))) and step.max() > _ROUNDING
     if starts_anew or (step > reach).any():
         return f"its odometry begins {step[0]:.2f} m and {np.degrees(step[1]):.0f} degrees apart"
     return ""
 
 
-def _usual_speed(recording: Recording, T: Float) -> Float:
-    """(2,) m/s and rad/s of fast motion along poses (T, D+1, D+1)."""
+def _quantile_speed(recording: Recording, T: Float) -> Float:
+    """(2,) m/s and rad/s, the 0.98 quantiles of the motion along poses (T, D+1, D+1)."""
     if len(T) < 2:
         return np.zeros(2)
     seconds = np.maximum(np.diff(recording.stamp_ns) / 1e9, _SHORTEST)

@@ -13,6 +13,7 @@ from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
 from stillmap.mapping.doors import Door
+from stillmap.mapping.mover_points import MoverPoints, is_explained
 
 Cells = NDArray[np.int64]
 Float = NDArray[np.float64]
@@ -25,66 +26,6 @@ _LINK_DISTANCE = 0.5  # m within which changed cells form one place
 _MAX_TIME_GAP = 2.0  # s between the changes of cells of one place
 _MIN_CELLS = 4  # of a listed change
 _NOISE = 2.0  # cells by which noise of poses and ranges moves surfaces
-# of movers that explain changes: nothing arrives or leaves in plain view by itself
-_UNSEEN = 2.0  # s between two observations, during which something may move unseen
-_REACH = 1.0  # m between a mover and what it moves: half of a car that parks, an arm
-_SLACK = 2.0  # s between the mover's end points and the change
-_SQUARE = 0.25  # m, see MoverPoints.thin
-
-
-class MoverPoints(NamedTuple):
-    """N end points on movers.
-
-    Attributes:
-        xy: (N, 2) metres in the map frame.
-        stamp_ns: (N,) stamps of their scans.
-    """
-
-    xy: Float
-    stamp_ns: Stamps
-
-    @classmethod
-    def none(cls) -> "MoverPoints":
-        """Without a point."""
-        return cls(np.zeros((0, 2)), np.zeros(0, np.int64))
-
-    @classmethod
-    def concatenate(cls, parts: Sequence["MoverPoints"]) -> "MoverPoints":
-        """All points of several sets."""
-        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-    def thin(self) -> "MoverPoints":
-        """One point per square of 25 cm and second."""
-        squares = np.floor(self.xy / _SQUARE).astype(np.int64)
-        cells = np.column_stack([squares, self.stamp_ns // 1_000_000_000])
-        some = np.unique(cells, axis=0, return_index=True)[1]
-        return MoverPoints(self.xy[some], self.stamp_ns[some])
-
-
-def _is_explained(
-    xy: Float, before_ns: Stamps, after_ns: Stamps, movers: MoverPoints
-) -> NDArray[np.bool_]:
-    """(K,) whether a change may be one: it was not in view then, or a mover was there.
-
-    Args:
-        xy: (K, 2) metres, places.
-        before_ns, after_ns: (K,) the observations before and after the change.
-        movers: end points on movers.
-    """
-    unseen = after_ns - before_ns > _UNSEEN * 1e9
-    if unseen.all() or not len(movers.xy):
-        return np.asarray(unseen)
-    from scipy.spatial import cKDTree  # slow to load
-
-    origin = int(movers.stamp_ns.min())
-    seconds = 1e-9 * (movers.stamp_ns - origin)
-    scale = 0.5 * _UNSEEN + _SLACK  # from the middle between the observations
-    tree = cKDTree(np.column_stack([movers.xy / _REACH, seconds / scale]))
-    middle = 1e-9 * (before_ns - origin + (after_ns - before_ns) // 2)
-    # all within 1 of each other in place and time
-    places = np.column_stack([xy / _REACH, middle / scale])
-    distance, _ = tree.query(places, p=np.inf, distance_upper_bound=1.0)
-    return np.asarray(unseen | np.isfinite(distance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +122,7 @@ def group_changes(
     events = _make_events(changed, np.flatnonzero(single), stamps)
     if movers is not None:
         xy = np.asarray((changed.cells[events.cell] + 0.5) * resolution, np.float64)
-        kept = _is_explained(xy, events.before, events.after, movers)
+        kept = is_explained(xy, events.before, events.after, movers)
         events = events.select(np.flatnonzero(kept))
     out = []
     for group in _group_events(events, changed.cells, radius):
@@ -235,7 +176,7 @@ def _explained_recurring(
     xy = np.asarray((changed.cells + 0.5) * resolution, np.float64)
     bins = np.maximum(changed.change_bins, 0)
     first, last = (
-        _is_explained(xy, stamps.last(bins[:, k, 0]), stamps.first(bins[:, k, 1]), movers)
+        is_explained(xy, stamps.last(bins[:, k, 0]), stamps.first(bins[:, k, 1]), movers)
         for k in (0, 1)
     )
     return np.asarray(first | last)

@@ -81,7 +81,7 @@ class MeshInputs:
         return slice(max(a, 0), min(b, len(stamps)))
 
     @cached_property
-    def _owned(self) -> list[tuple[TrackedBox, Index]]:
+    def _beams_of_boxes(self) -> list[tuple[TrackedBox, Index]]:
         """Boxes with the beams of their objects."""
         beams = {one.id: one.beams for one in self.objects}
         return [(one, beams[one.box.object_id]) for one in self.boxes if one.box.object_id in beams]
@@ -90,7 +90,7 @@ class MeshInputs:
     def _on_dynamic_object(self) -> Bool:
         """(M,) whether a beam ended on an object and is rather dynamic."""
         out = np.zeros(len(self.p_static), np.bool_)
-        for _, owned in self._owned:
+        for _, owned in self._beams_of_boxes:
             out[owned] = self.p_static[owned] < 0.5
         return out
 
@@ -112,7 +112,7 @@ class MeshInputs:
             near |= (away <= tracked) & self._on_dynamic_object[beams]
         beams = beams[self.deskewed.hit[beams] & near]
         ends = self.deskewed.end_points(beams, self.poses)
-        for box, owned in self._owned if len(beams) else ():
+        for box, owned in self._beams_of_boxes if len(beams) else ():
             first, last = np.searchsorted(owned, beams[[0, -1]])
             mine = np.flatnonzero(np.isin(beams, owned[first : last + 1]))
             ends[mine, :2] += box.motion_until(now, self.seconds_of(beams[mine]))

@@ -44,7 +44,7 @@ _FAST_TRAVEL = 3.0  # m along the path of a fast mover that count as a window of
 _MAX_LINE_SPREAD = 1.25  # times the noise, across a straight surface
 _MIN_LINE, _MAX_SLIDE_SPEED = 0.75, 0.25  # m of it: people are less wide; m/s: they walk faster
 _P_WALKS_ON_LINE = 0.01  # that end points on who walks spread as little: 4 tracks of nine runs
-_BATCH = 1 << 12  # tracks whose looks are classified at once
+_BATCH = 1 << 12  # tracks whose places are classified at once
 _DEPTH = 0.3  # m in front of and behind the place that count as the place
 _HALF_WIDTH = 0.08  # m to either side, of a leg
 _MAX_BEARING = 0.06  # rad to the nearest beam: farther off is out of view
@@ -226,8 +226,8 @@ def _count_passes(recording: Recording, T_map_sensor: Float, places: list[Places
     """(L,) looks that passed, of L lists of places."""
     of = np.repeat(np.arange(len(places)), [len(scan) for scan, _ in places])
     scan, xy = (np.concatenate(column) for column in zip(*places, strict=True))
-    look = _classify_looks(recording, T_map_sensor, scan, xy)
-    passed = (look == Look.PASSED).astype(np.float64)
+    visibility = _classify_visibility(recording, T_map_sensor, scan, xy)
+    passed = (visibility == Visibility.PASSED).astype(np.float64)
     return np.asarray(np.bincount(of, passed, minlength=len(places)), np.float64)
 
 
@@ -256,7 +256,7 @@ def _extrapolate_ends(seconds: Float, scan: Index, xy: Float) -> Iterator[Places
         yield some, xy[at] + (seconds[some] - t[at])[:, None] * velocity
 
 
-class Look(IntEnum):
+class Visibility(IntEnum):
     """Outcome of the beams in the direction of a place."""
 
     HIDDEN = -1  # they end before it, or there are none
@@ -264,8 +264,10 @@ class Look(IntEnum):
     PASSED = 1  # they end behind it
 
 
-def _classify_looks(recording: Recording, T_map_sensor: Float, scan: Index, xy: Float) -> Index:
-    """(Q,) the Look of scans `scan` (Q,) at places `xy` (Q, 2), metres in the map frame.
+def _classify_visibility(
+    recording: Recording, T_map_sensor: Float, scan: Index, xy: Float
+) -> Index:
+    """(Q,) the Visibility, in scans `scan` (Q,), of places `xy` (Q, 2), metres in the map frame.
 
     The beam nearest in direction decides with those on either side of it that are less than 8 cm
     off: most of them pass the place, or end before it. A beam without a return passes if more of
@@ -275,7 +277,7 @@ def _classify_looks(recording: Recording, T_map_sensor: Float, scan: Index, xy: 
         recording: 2D.
         T_map_sensor: (T, 3, 3) sensor poses.
     """
-    out = np.full(len(scan), Look.HIDDEN, np.intp)
+    out = np.full(len(scan), Visibility.HIDDEN, np.intp)
     order = np.argsort(scan, kind="stable")
     cuts = np.flatnonzero(np.diff(scan[order])) + 1
     groups = np.split(order, cuts) if len(order) else []
@@ -286,15 +288,15 @@ def _classify_looks(recording: Recording, T_map_sensor: Float, scan: Index, xy: 
         beams = recording.beams_of(t)
         points, hit = recording.points[beams], recording.hit[beams]
         lost = find_lost_beams(hit, points, np.zeros(len(hit), np.intp))
-        out[here] = _look_at(points[~lost], (xy[here] - origin) @ R)
+        out[here] = _classify_places(points[~lost], (xy[here] - origin) @ R)
     return out
 
 
-def _look_at(points: NDArray[np.float32], place: Float) -> Index:
-    """(n,) the Look of a scan with end points (N, 2) at places (n, 2), in the sensor frame."""
+def _classify_places(points: NDArray[np.float32], place: Float) -> Index:
+    """(n,) the Visibility of places (n, 2) in one scan, end points (N, 2), in the sensor frame."""
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
-        return np.full(len(place), Look.HIDDEN, np.intp)
+        return np.full(len(place), Visibility.HIDDEN, np.intp)
     bearing = np.arctan2(points[:, 1], points[:, 0])
     order = np.argsort(bearing)
     bearing, distance = bearing[order], np.hypot(points[order, 0], points[order, 1])
@@ -308,5 +310,7 @@ def _look_at(points: NDArray[np.float32], place: Float) -> Index:
     count = near.sum(axis=1)
     past = 2 * (near & (distance[beams] > far[:, None] + _DEPTH)).sum(axis=1) > count
     before = 2 * (near & (distance[beams] < far[:, None] - _DEPTH)).sum(axis=1) > count
-    look = np.where(past, Look.PASSED, np.where(before, Look.HIDDEN, Look.REACHED))
-    return np.where(nearest > _MAX_BEARING, Look.HIDDEN, look).astype(np.intp)
+    visibility = np.where(
+        past, Visibility.PASSED, np.where(before, Visibility.HIDDEN, Visibility.REACHED)
+    )
+    return np.where(nearest > _MAX_BEARING, Visibility.HIDDEN, visibility).astype(np.intp)

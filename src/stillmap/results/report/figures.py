@@ -54,7 +54,7 @@ class MapView:
         return cls(window, (width, height), factor)
 
     @property
-    def reduced(self) -> bool:
+    def is_reduced(self) -> bool:
         """True if several cells share a pixel."""
         return self.factor > 1
 

@@ -38,7 +38,7 @@ def _environment() -> "Environment":
     # jinja2 is loaded only where a report is written
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    found = Environment(
+    environment = Environment(
         bytecode_cache=_bytecode_cache(),
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -46,8 +46,8 @@ def _environment() -> "Environment":
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters.update(FILTERS)
-    return found
+    environment.filters.update(FILTERS)
+    return environment
 
 
 def _bytecode_cache() -> "BytecodeCache | None":
