@@ -79,7 +79,7 @@ def test_small_picture_keeps_what_shares_a_pixel_with_a_change(place):
     p_occupied[row - 1, column : column + SIZE] = 1.0  # a wall below the chair
     grid = replace(grid, p_occupied=p_occupied)
     small = PlacePictures(grid, timeline, 20 * 15)
-    assert small.view.reduced
+    assert small.view.is_reduced
     first = np.array(ORIGIN) + CELL * (np.array([column, row - 1]) + 0.5)
     x, y = np.floor(small.view.to_pixels(first[None])[0]).astype(int)
     assert small.draw(0).convert("RGB").getpixel((x, y)) == BLACK
