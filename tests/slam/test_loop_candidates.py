@@ -11,6 +11,7 @@ from stillmap.slam import (
     SlamOptions,
 )
 from stillmap.slam.loop_candidates import (
+    graph_distances,
     odometry_constraints,
     propose_candidates,
     split_stages,
@@ -110,3 +111,14 @@ def test_consistency_by_stages_equals_consistency_at_once():
             new = found[: first + stage]
             decided = reject_inconsistent_since(context, chain, new, decided, 21 + first)
         assert [c.rejected for c in decided] == at_once
+
+
+def test_drift_between_two_keyframes_is_that_of_the_more_certain_edge():
+    """A closure between neighbours of the chain counts only where it is shorter than the travel."""
+    context = straight(4)
+    certain, uncertain = np.eye(3) * 0.003**2, np.eye(3) * 0.3**2
+    assert graph_distances(context, 3, [tie(0, 3, uncertain)]).tolist() == [3.0, 2.0, 1.0, 0.0]
+    np.testing.assert_allclose(
+        graph_distances(context, 3, [tie(1, 2, uncertain), tie(1, 2, certain)]),
+        [2.5, 1.5, 1.0, 0.0],
+    )

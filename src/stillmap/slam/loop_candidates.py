@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csgraph, csr_array
 
-import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
@@ -81,7 +81,11 @@ def _shortest_paths(
     ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
     # even where the robot stands a path through fewer keyframes is the shorter one
     weights = np.concatenate([steps, lengths[is_before]]).clip(1e-9)
-    return _core.shortest_paths(np.stack(ends, axis=1), weights, k + 1, k)
+    order = np.argsort(weights)  # of edges between the same keyframes the shortest counts
+    ends = np.sort(ends, axis=0)[:, order]
+    ends, shortest = np.unique(ends, axis=1, return_index=True)
+    graph = csr_array((weights[order][shortest], ends), shape=(k + 1, k + 1))
+    return csgraph.dijkstra(graph, directed=False, indices=k)
 
 
 def blind_stds(context: LoopContext, k: int, closures: list[LoopClosure]) -> tuple[Float, Float]:
