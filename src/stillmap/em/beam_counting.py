@@ -5,13 +5,13 @@ model of dynamics use: a cell is free where more beams pass than end.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.chunks import iter_beams, iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em.occupancy_grid import BLOCK_CELLS
-from stillmap.em.types import CellProbabilities, EStepResult, Float, Grid, Likelihood, fill_beams
+from stillmap.em.types import CellProbabilities, EStepResult, Grid, Likelihood, fill_beams
 
 MIN_HIT_RATIO = 0.25  # hits / (hits + passes) below which such mappers drop a cell
 
@@ -35,12 +35,7 @@ def paper_e_step(
 
 
 def log_likelihood(
-    recording: Recording,
-    poses: Float,
-    grid: Grid,
-    e: NDArray[np.float32],
-    prior: float,
-    threads: int = 1,
+    recording: Recording, poses: Float, grid: Grid, e: Float32, prior: float, threads: int = 1
 ) -> Likelihood:
     """Expected log likelihood (5) and the bound of EM at the map of `grid`."""
     total = np.zeros(4)  # the terms of (5), and the entropy of the posterior
@@ -117,7 +112,7 @@ def beam_boxes(recording: Recording, poses: Float) -> Float:
 def count_in_window(
     recording: Recording,
     poses: Float,
-    e: NDArray[np.float32],
+    e: Float32,
     boxes: Float,
     window: Box,
     resolution: float,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import connected_components, neighbor_pairs
@@ -26,7 +27,7 @@ from stillmap.em.observations import (
     surfel_cells,
 )
 from stillmap.em.options import EmOptions, MapState
-from stillmap.em.types import MIN_PROBABILITY, ChangedCells, Float
+from stillmap.em.types import MIN_PROBABILITY, ChangedCells
 
 _STATE_DURATION = 2.0  # mean duration of a state, in units of the recording's length
 _MAX_STATE_DURATION = 3600.0  # s
@@ -63,25 +64,25 @@ class CellHistories(ChangedCells):
         surfel_map: the cells as surfels.
     """
 
-    p_static: NDArray[np.float32]
-    p_view_dependent: NDArray[np.float32]
-    p_changing: NDArray[np.float32]
-    occupied_share: NDArray[np.float32]
-    p_in_cell: NDArray[np.float32]
+    p_static: Float32
+    p_view_dependent: Float32
+    p_changing: Float32
+    occupied_share: Float32
+    p_in_cell: Float32
     changing_weight: float
     surfel_map: SurfelMap
 
     @property
-    def p_unchanged(self) -> NDArray[np.float32]:
+    def p_unchanged(self) -> Float32:
         """(E,) probability of surface that never left."""
         return self.p_static + self.p_view_dependent
 
     @property
-    def unchanged_cells(self) -> NDArray[np.int64]:
+    def unchanged_cells(self) -> Int64:
         """(U, 2) those that more probably than not hold surface that never left."""
         return self.cells[self.p_unchanged > 0.5]
 
-    def share_there(self, state: MapState) -> NDArray[np.float32]:
+    def share_there(self, state: MapState) -> Float32:
         """(E,) probability that an object is in the cell at last, or its share of the time.
 
         Of states of doors, the last one.
@@ -92,9 +93,7 @@ class CellHistories(ChangedCells):
             return self.occupied_share
         return np.where(self.n_changes < MIN_RECURRING_CHANGES, self.p_object, np.float32(0.0))
 
-    def p_in_map(
-        self, state: MapState, share: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
+    def p_in_map(self, state: MapState, share: Float32 | None = None) -> Float32:
         """(E,) probability that a map of changed places in that state has something in the cell.
 
         Args:
@@ -144,13 +143,7 @@ class _MixtureClasses:
         static, view, half_time, changing: (N,) masks, none of which overlap.
     """
 
-    def __init__(
-        self,
-        view: NDArray[np.bool_],
-        half_time: NDArray[np.bool_],
-        n_static: int,
-        with_surroundings: bool,
-    ) -> None:
+    def __init__(self, view: Bool, half_time: Bool, n_static: int, with_surroundings: bool) -> None:
         n = len(view) + 1
         self.n_static, self.columns = n_static, np.arange(n)
         view, half_time = np.append(view, False), np.append(half_time, False)
@@ -195,7 +188,7 @@ class ChangeMixture:
         self._weights = fit_weights(sample, classes.n_static, options.prior)
         self.changing_weight = float(self._weights[-1])
 
-    def _likelihood(self, rows: Rows) -> NDArray[np.float32]:
+    def _likelihood(self, rows: Rows) -> Float32:
         """(K, N) of some surfels, relative to the best class; the change HMM is bounded."""
         hmm = self._observations.hmm
         likelihood, log_best = self._observations.likelihood(self._kept, rows)
@@ -208,7 +201,7 @@ class ChangeMixture:
         both = np.concatenate([table * lasting[:, None], table * empty[:, None]], axis=1)
         return np.asarray(both[:, self._columns])
 
-    def label_surfels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def label_surfels(self) -> tuple[Float32, Float32]:
         """Labels of each surfel.
 
         Returns:
@@ -268,9 +261,7 @@ class ChangeMixture:
         }
 
 
-def _mean_likelihood(
-    likelihood: NDArray[np.float32], weights: Float, among: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def _mean_likelihood(likelihood: Float32, weights: Float, among: Bool) -> Float32:
     """(K,) likelihood under some classes (C,), averaged by their weights."""
     w = np.where(among, weights, 0.0) / max(float(weights[among].sum()), _MIN_LIKELIHOOD)
     return np.asarray(np.einsum("kc,c->k", likelihood, w.astype(np.float32)), np.float32)
@@ -310,6 +301,6 @@ def select_changed_cells(cells: CellHistories) -> ChangedCells:
     )
 
 
-def _log_odds(p: NDArray[np.floating]) -> NDArray[np.float64]:
+def _log_odds(p: NDArray[np.floating]) -> Float:
     kept = np.clip(p.astype(np.float64), MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
     return np.asarray(np.log(kept / (1.0 - kept)))

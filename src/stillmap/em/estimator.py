@@ -3,9 +3,9 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import iter_beams, iter_chunks
 from stillmap.core.parallel import counting_threads
@@ -14,7 +14,7 @@ from stillmap.em import beam_counting, occupancy_hmm
 from stillmap.em.occupancy_grid import ObservedCells, observed_cells
 from stillmap.em.options import EmOptions
 from stillmap.em.people_tracker import label_people
-from stillmap.em.types import EStepResult, Float, Grid, NoReturnModel, fill_beams
+from stillmap.em.types import EStepResult, Grid, NoReturnModel, fill_beams
 from stillmap.prepare.floor_detection import find_floor_returns
 
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
@@ -33,9 +33,7 @@ _LABEL_CHANGE = 0.1 + 1e-6
 _TOUCHED = 0.2  # of the hits of a scan, whose change may change its pose
 
 
-def initial_p_static(
-    recording: Recording, estimator: Estimator, options: EmOptions
-) -> NDArray[np.float32]:
+def initial_p_static(recording: Recording, estimator: Estimator, options: EmOptions) -> Float32:
     """(M,) e := p(c = 1) for every beam (start of Fig. 2); 1 for estimators that count.
 
     In 2D the default estimator begins with a lower prior for what is floor by odometry: with floor
@@ -126,7 +124,7 @@ def add_recording(
     grid: Grid,
     recording: Recording,
     poses: Float,
-    e: NDArray[np.float32] | None,
+    e: Float32 | None,
     threads: int = 1,
     *,
     hits_only: bool = False,
@@ -150,9 +148,7 @@ def add_recording(
         _core.add_beams(grid, points, hit, weights, offset, T, used)
 
 
-def recount_as_static(
-    grid: Grid, recording: Recording, poses: Float, e: NDArray[np.float32]
-) -> None:
+def recount_as_static(grid: Grid, recording: Recording, poses: Float, e: Float32) -> None:
     """Turns counts that were added with e into those with e = 1, to the bit."""
     for _, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=[e]):
         _core.add_end_points(grid, points, hit, e[beams], offset, T, remove=True)
@@ -163,7 +159,7 @@ def add_trusted_beams(
     grid: _core.OccupancyGrid2D,
     recording: Recording,
     poses: Float,
-    e: NDArray[np.float32],
+    e: Float32,
     no_return: NoReturnModel | None,
     threads: int = 1,
     places: Float | None = None,
@@ -189,9 +185,7 @@ def add_trusted_beams(
     return observed
 
 
-def changed_share(
-    before: NDArray[np.float32], after: NDArray[np.float32], hit: NDArray[np.bool_]
-) -> float:
+def changed_share(before: Float32, after: Float32, hit: Bool) -> float:
     """Share of the hits whose P(static) changed by more than 0.1 between two iterations."""
     n_changed = n_hits = 0
     for block in iter_blocks(before, after, hit):
@@ -201,9 +195,7 @@ def changed_share(
     return n_changed / max(n_hits, 1)
 
 
-def touched_share(
-    recording: Recording, before: NDArray[np.float32], after: NDArray[np.float32]
-) -> float:
+def touched_share(recording: Recording, before: Float32, after: Float32) -> float:
     """Share of the scans of whose hits a fifth or more changed P(static) between two iterations.
 
     Only these can be matched differently in the next M-step.

@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import finite_rows
 from stillmap.core.recording import Recording
 from stillmap.em.change_hmm import CellHistories, ChangeMixture, change_parameters
@@ -24,7 +24,7 @@ from stillmap.em.observations import (
 from stillmap.em.occupancy_hmm import ClassFit, fit_classes, label_beams
 from stillmap.em.options import EmOptions
 from stillmap.em.shape_evidence import ShapeEvidence
-from stillmap.em.types import DYNAMIC_BELOW, EStepResult, Float
+from stillmap.em.types import DYNAMIC_BELOW, EStepResult
 
 _CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # rho and tau (s) of places crossed by many people
 _WAITING_TAU = 6.0  # s; used for change detection only, not for labels
@@ -75,7 +75,7 @@ def final_e_step(
     return labels, ChangeMixture(observations, options).decode_histories()
 
 
-def _label_classes(observations: Observations) -> NDArray[np.bool_]:
+def _label_classes(observations: Observations) -> Bool:
     """(C,) classes used for labels; without the crowd class, which explains chairs as well."""
     crowds = (observations.rho == _CROWD_RHO) & (observations.tau == _CROWD_TAU)
     kept = ~crowds & (observations.tau != _WAITING_TAU) & (observations.rho != HALF_TIME_RHO)
@@ -85,7 +85,7 @@ def _label_classes(observations: Observations) -> NDArray[np.bool_]:
 
 def _fit_with_shapes(
     observations: Observations,
-    classes: NDArray[np.bool_],
+    classes: Bool,
     options: EmOptions,
     fit: ClassFit,
     shapes: ShapeEvidence,
@@ -125,10 +125,7 @@ class ExpectedCounts(NamedTuple):
 
 
 def count_expected(
-    recording: Recording,
-    candidates: Iterable[Float],
-    p_static: NDArray[np.float32],
-    threads: int = 1,
+    recording: Recording, candidates: Iterable[Float], p_static: Float32, threads: int = 1
 ) -> ExpectedCounts:
     """Expected counts of the labels of some scans.
 

@@ -1,16 +1,14 @@
 """Ground segmentation: level, static surface as far below the sensors as the robot is high."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import bound_box
 from stillmap.em.observations import SurfelMap, iter_surfel_rows
-from stillmap.em.types import DYNAMIC_BELOW, GROUND_SQUARE, Float, GroundMap
-
-Index = NDArray[np.intp]
+from stillmap.em.types import DYNAMIC_BELOW, GROUND_SQUARE, GroundMap
 
 _RESOLUTION = 0.3  # m, of the surfel map from which level surface is taken
 _MIN_NORMAL_Z = 0.85  # |z| of the normal above which a surfel is level
@@ -24,7 +22,7 @@ _LEAST_SQUARES, _MOST_SQUARES = 1 << 20, 1 << 26
 
 
 def estimate_ground(
-    recording: Recording, poses: Float, p_static: NDArray[np.float32], threads: int = 1
+    recording: Recording, poses: Float, p_static: Float32, threads: int = 1
 ) -> GroundMap:
     """Estimates the ground from the static end points of a recording.
 
@@ -43,9 +41,7 @@ def estimate_ground(
     return ground_from_surfels(surfel_map, every, recording.T_map_sensor(poses)[:, :3, 3])
 
 
-def ground_from_surfels(
-    surfel_map: SurfelMap, p_static: NDArray[np.float32], positions: Float
-) -> GroundMap:
+def ground_from_surfels(surfel_map: SurfelMap, p_static: Float32, positions: Float) -> GroundMap:
     """Estimates the ground from the static surfels of a map.
 
     Args:
@@ -166,7 +162,7 @@ def _mean_of_neighbors(z: Float, squares: Index) -> Float:
     return np.asarray(np.where(known, around, 0.0).sum(axis=0) / known.sum(axis=0))
 
 
-def _neighbors(z: Float, squares: Index) -> tuple[Index, NDArray[np.bool_]]:
+def _neighbors(z: Float, squares: Index) -> tuple[Index, Bool]:
     """(4, n) flat index of the neighbours of squares, and whether they lie in the grid."""
     H, W = z.shape
     row, column = np.divmod(squares, W)

@@ -1,9 +1,8 @@
 """Mixture weights of the HMM classes, fitted by expectation maximisation."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stillmap.em.types import Float
+from stillmap.core.array_types import Bool, Float, Float32
 
 MAX_FIT_ROWS = 100_000  # maximum number of rows used in the fit; more make no relevant difference
 _PSEUDO_COUNT = 1.0  # per class, so that none becomes impossible
@@ -11,12 +10,12 @@ _MAX_STATIC_WEIGHT = 0.998  # upper bound: no recording proves that nothing move
 
 
 def fit_weights(
-    likelihood: NDArray[np.float32],
+    likelihood: Float32,
     n_static: int,
     initial_static: float,
     max_iterations: int = 100,
     tolerance: float = 1e-6,
-    rare: NDArray[np.bool_] | None = None,
+    rare: Bool | None = None,
 ) -> Float:
     """(C,) weights w, which sum to one: EM maximises sum_k ln sum_c w_c L_kc, up to a pseudo-count.
 
@@ -60,7 +59,7 @@ def _normalize(counts: Float, n_static: int, initial_static: float) -> Float:
     )
 
 
-def _limit(weights: Float, rare: NDArray[np.bool_], max_weight: float) -> Float:
+def _limit(weights: Float, rare: Bool, max_weight: float) -> Float:
     """The weights nearest to the expected counts under an upper bound of some classes' total."""
     total = float(weights[rare].sum())
     if total <= max_weight:
@@ -68,9 +67,7 @@ def _limit(weights: Float, rare: NDArray[np.bool_], max_weight: float) -> Float:
     return weights * np.where(rare, max_weight / total, (1.0 - max_weight) / (1.0 - total))
 
 
-def posterior_static(
-    likelihood: NDArray[np.float32], weights: Float, n_static: int
-) -> NDArray[np.float32]:
+def posterior_static(likelihood: Float32, weights: Float, n_static: int) -> Float32:
     """(K,) responsibility of the static classes for each row (K, C)."""
     w = weights.astype(np.float32)
     static = np.einsum("kc,c->k", likelihood[:, :n_static], w[:n_static])
@@ -78,9 +75,7 @@ def posterior_static(
     return np.asarray(static / (static + dynamic), dtype=np.float32)
 
 
-def posterior(
-    likelihood: NDArray[np.float32], weights: Float, among: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def posterior(likelihood: Float32, weights: Float, among: Bool) -> Float32:
     """(K,) responsibility of some classes (C,) for each row (K, C)."""
     w = weights.astype(np.float32)
     inside, outside = (

@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
 from stillmap.em.mixture import MAX_FIT_ROWS
 from stillmap.em.options import EmOptions
-from stillmap.em.types import Float
 
 SurfelMap = _core.SurfelMap2D | _core.SurfelMap3D
 OccupancyHmm = _core.OccupancyHmm2D | _core.OccupancyHmm3D
@@ -112,8 +111,8 @@ class Observations:
     has_surroundings: bool = False
 
     def likelihood(
-        self, classes: NDArray[np.bool_] | None = None, rows: Rows | None = None
-    ) -> tuple[NDArray[np.float32], Float]:
+        self, classes: Bool | None = None, rows: Rows | None = None
+    ) -> tuple[Float32, Float]:
         """Likelihood of the observations of surfels under some of the classes.
 
         Args:
@@ -125,7 +124,7 @@ class Observations:
         """
         return self.hmm.likelihood(classes, rows, self.threads)
 
-    def likelihood_of_surroundings(self, rows: Rows) -> NDArray[np.float32]:
+    def likelihood_of_surroundings(self, rows: Rows) -> Float32:
         """(K, 2) of the misses of some surfels; see `surroundings.likelihood_of_misses`."""
         assert isinstance(self.hmm, _core.OccupancyHmm3D)
         return likelihood_of_misses(self.hmm.miss_counts(rows))
@@ -178,7 +177,7 @@ def build_surfel_map(
     poses: Float,
     resolution: float,
     threads: int = 1,
-    time_bin: NDArray[np.int64] | None = None,
+    time_bin: Int64 | None = None,
 ) -> SurfelMap:
     """Mean, normal and noise of the end points in every cell where beams ended.
 
@@ -199,12 +198,12 @@ def iter_surfel_rows(surfel_map: SurfelMap) -> Iterator[Rows]:
         yield first, min(first + _SURFELS_PER_BLOCK, surfel_map.size), 1
 
 
-def surfel_cells(surfel_map: SurfelMap) -> NDArray[np.int64]:
+def surfel_cells(surfel_map: SurfelMap) -> Int64:
     """(E, D) cell of each surfel."""
     return np.concatenate([surfel_map.surfels(rows)[0] for rows in iter_surfel_rows(surfel_map)])
 
 
-def time_bin_index(recording: Recording, seconds: float) -> NDArray[np.int64]:
+def time_bin_index(recording: Recording, seconds: float) -> Int64:
     """(T,) time bin of each scan, counted from the first scan.
 
     After a clock jump of decades all scans fall into the last bin.
@@ -299,7 +298,7 @@ def _without_blank_scans(data: ScanBeams) -> ScanBeams:
     return data._replace(points=np.where(blank[:, None], np.float32(np.nan), data.points))
 
 
-def probability_in_cell(surfel_map: SurfelMap) -> NDArray[np.float32]:
+def probability_in_cell(surfel_map: SurfelMap) -> Float32:
     """(E,) probability that the surface runs through the cell: noise also fills cells beside it."""
     out = np.empty(surfel_map.size, np.float32)
     for rows in iter_surfel_rows(surfel_map):
@@ -317,7 +316,7 @@ _LASTING = 9.0  # Beta(9, 1): share of the misses during which lasting surroundi
 _MAX_MISSES = 20  # that count; more of one surfel are not independent
 
 
-def likelihood_of_misses(counts: NDArray[np.float32]) -> NDArray[np.float32]:
+def likelihood_of_misses(counts: Float32) -> Float32:
     """Likelihood (K, 2) of the misses of surfels if their surroundings last, and if they empty.
 
     Args:
@@ -334,7 +333,7 @@ def likelihood_of_misses(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @functools.cache
-def _table() -> NDArray[np.float32]:
+def _table() -> Float32:
     """(N, N, 2) by the numbers of misses and of those with hits in the surroundings."""
     size = _MAX_MISSES + 1
     logs = np.zeros((size, size, 2))

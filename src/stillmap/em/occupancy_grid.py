@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.grid_map import GridMap
 from stillmap.core.square_box import SquareBox, bound_box
 from stillmap.core.tiles import (
@@ -20,7 +20,7 @@ from stillmap.core.tiles import (
     release,
     tiles_around,
 )
-from stillmap.em.types import CellProbabilities, Float, Grid
+from stillmap.em.types import CellProbabilities, Grid
 
 BLOCK_CELLS = 32  # edge of the blocks of the grid
 # blocks of the box of a map: up to which it is always whole (a square of 580 m at 0.05 m), and at
@@ -36,7 +36,7 @@ class ObservedCells(NamedTuple):
         mask: (h, w) bool.
     """
 
-    first_cell: NDArray[np.int64]
+    first_cell: Int64
     mask: TiledArray
 
 
@@ -48,7 +48,7 @@ class GridWindow(NamedTuple):
         shape: rows and columns.
     """
 
-    first_cell: NDArray[np.int64]
+    first_cell: Int64
     shape: tuple[int, int]
 
 
@@ -61,8 +61,8 @@ class OccupancyMap(GridMap):
         beta: (H, W) float32, expected number of dynamic hits + beam length through the cell.
     """
 
-    alpha: NDArray[np.float32]
-    beta: NDArray[np.float32]
+    alpha: Float32
+    beta: Float32
 
     @property
     def window(self) -> GridWindow:
@@ -167,7 +167,7 @@ def find_hits_beyond(grid: _core.OccupancyGrid2D, window: GridWindow) -> Float:
     return np.asarray((beyond + 0.5) * (BLOCK_CELLS * grid.resolution))
 
 
-def _hit_blocks(grid: _core.OccupancyGrid2D) -> NDArray[np.int64]:
+def _hit_blocks(grid: _core.OccupancyGrid2D) -> Int64:
     """(B, 2) column and row of the blocks in which beams ended; all blocks where none did."""
     blocks = grid.block_cells
     hit = [bool(grid.dense(one, (BLOCK_CELLS, BLOCK_CELLS))[1].any()) for one in blocks.tolist()]
@@ -187,9 +187,7 @@ def _iter_tiles(
             yield (i, j), alpha, beta
 
 
-def _probabilities(
-    alpha: Float, beta: Float, occupied: CellProbabilities | None
-) -> NDArray[np.float32]:
+def _probabilities(alpha: Float, beta: Float, occupied: CellProbabilities | None) -> Float32:
     """(15), or the occupancy of cells that beams only passed; NaN where none did."""
     crossed = alpha + beta > 0.0
     p = np.full(alpha.shape, np.nan, np.float32)
@@ -201,9 +199,7 @@ def _probabilities(
     return p
 
 
-def _overlay(
-    p_occupied: TiledArray, occupied: CellProbabilities, first_cell: NDArray[np.int64]
-) -> None:
+def _overlay(p_occupied: TiledArray, occupied: CellProbabilities, first_cell: Int64) -> None:
     """Adds surfaces to a map of passed cells, in place: p + (1 - p) * p_passed."""
     at = (occupied.cells - first_cell)[:, ::-1]
     inside = ((at >= 0) & (at < p_occupied.shape)).all(axis=1)

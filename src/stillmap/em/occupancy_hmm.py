@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.chunks import iter_beams
 from stillmap.core.parallel import map_ordered, work_beside
 from stillmap.core.recording import Recording
@@ -35,14 +35,7 @@ from stillmap.em.observations import (
 )
 from stillmap.em.options import EmOptions
 from stillmap.em.spatial_coupling import ObstacleSurfels
-from stillmap.em.types import (
-    CellProbabilities,
-    EStepResult,
-    Float,
-    Likelihood,
-    NoReturnModel,
-    fill_beams,
-)
+from stillmap.em.types import CellProbabilities, EStepResult, Likelihood, NoReturnModel, fill_beams
 
 _FREE_PRIOR = 0.2  # occupancy probability of a cell in which no beam ended and none passed
 _LONG_TAU = 12.0  # s, from which on a mover resembles a wall that two visits put in two places
@@ -127,16 +120,16 @@ class ClassFit(NamedTuple):
     """
 
     weights: Float
-    p_static: NDArray[np.float32]
-    p_view_dependent: NDArray[np.float32]
+    p_static: Float32
+    p_view_dependent: Float32
     likelihood: Likelihood
 
 
 def fit_classes(
     observations: Observations,
-    classes: NDArray[np.bool_] | None,
+    classes: Bool | None,
     options: EmOptions,
-    shapes: NDArray[np.float32] | None = None,
+    shapes: Float32 | None = None,
 ) -> ClassFit:
     """Fits the weights of some classes; None: all.
 
@@ -150,11 +143,11 @@ def fit_classes(
 
 def label_beams(
     observations: Observations,
-    classes: NDArray[np.bool_] | None,
+    classes: Bool | None,
     fit: ClassFit,
     recording: Recording,
     poses: Float,
-    p_static: NDArray[np.float32] | None = None,
+    p_static: Float32 | None = None,
     obstacles: ObstacleSurfels | None = None,
 ) -> EStepResult:
     """Labels each beam by the cell in which it ended.
@@ -193,9 +186,7 @@ def label_beams(
     )
 
 
-def _long_movers(
-    observations: Observations, classes: NDArray[np.bool_] | None
-) -> NDArray[np.bool_]:
+def _long_movers(observations: Observations, classes: Bool | None) -> Bool:
     """Select those of the used classes that are movers that stay for long.
 
     Poses that disagree by decimetres let a wall appear in two places, each hit during one visit and
@@ -209,11 +200,8 @@ def _long_movers(
 
 
 def _likelihood_with_shapes(
-    observations: Observations,
-    classes: NDArray[np.bool_] | None,
-    rows: Rows,
-    shapes: NDArray[np.float32] | None,
-) -> tuple[NDArray[np.float32], Float]:
+    observations: Observations, classes: Bool | None, rows: Rows, shapes: Float32 | None
+) -> tuple[Float32, Float]:
     """Likelihood (K, C) of some surfels, times the factors of their shapes (E, 2).
 
     Relative to the best class without them, whose logarithm (K,) comes second.
@@ -226,20 +214,15 @@ def _likelihood_with_shapes(
     return table, log_best
 
 
-def _view_dependent(
-    observations: Observations, classes: NDArray[np.bool_] | None
-) -> NDArray[np.bool_]:
+def _view_dependent(observations: Observations, classes: Bool | None) -> Bool:
     """Select those of the used classes that are view-dependent."""
     of = slice(None) if classes is None else classes
     return np.asarray(np.isfinite(observations.view_angle[of]))
 
 
 def _surfel_posterior(
-    observations: Observations,
-    classes: NDArray[np.bool_] | None,
-    weights: Float,
-    shapes: NDArray[np.float32] | None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Likelihood]:
+    observations: Observations, classes: Bool | None, weights: Float, shapes: Float32 | None
+) -> tuple[Float32, Float32, Likelihood]:
     """(E,) P(static) and P(view-dependent) of each surfel, and the bound sum ln sum_c w_c L_c."""
     p_static, p_view = np.zeros((2, observations.surfel_map.size), np.float32)
     bound, entropy = 0.0, 0.0
@@ -264,7 +247,7 @@ def _surfel_posterior(
 
 
 def _parameter_record(
-    observations: Observations, classes: NDArray[np.bool_] | None, weights: Float, p_static: float
+    observations: Observations, classes: Bool | None, weights: Float, p_static: float
 ) -> dict[str, object]:
     """The fitted parameters, as `run.json` lists them."""
     n, of = observations.n_static, slice(None) if classes is None else classes

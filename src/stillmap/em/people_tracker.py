@@ -12,17 +12,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import kalman, se2
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.kalman import TrackStates
 from stillmap.core.recording import Recording
-from stillmap.em.types import Float
-
-Index = NDArray[np.intp]
-
 
 _NO_RETURN_RANGE = 1e6  # m, farther than any return
 _RANGE_JUMP = 0.3  # m between neighbouring beams that separates segments
@@ -70,7 +66,7 @@ def detect_segments(recording: Recording, T_map_sensor: Float) -> Detections:
     return Detections(scan, xy, width)
 
 
-def _ranges(points: Float, hit: NDArray[np.bool_]) -> Float:
+def _ranges(points: Float, hit: Bool) -> Float:
     """(N,) metres to end points (N, 2); beams without a return are farther than all others."""
     return np.where(hit, np.hypot(*points.T), _NO_RETURN_RANGE)
 
@@ -112,9 +108,7 @@ def _widths(points: Float, r: Float, first: Index, last: Index) -> Float:
     return np.asarray(0.5 * (inner + outer) * 0.5 * (r[first] + r[last]))
 
 
-def find_changed(
-    recording: Recording, T_map_sensor: Float, detections: Detections
-) -> NDArray[np.bool_]:
+def find_changed(recording: Recording, T_map_sensor: Float, detections: Detections) -> Bool:
     """(F,) detections whose position the same laser saw free two seconds before or after.
 
     Args:
@@ -148,7 +142,7 @@ def _compared_scans(recording: Recording) -> list[list[int]]:
     return out
 
 
-def _is_free(recording: Recording, scan: int, T_map_sensor: Float, xy: Float) -> NDArray[np.bool_]:
+def _is_free(recording: Recording, scan: int, T_map_sensor: Float, xy: Float) -> Bool:
     """(F,) whether all beams of a scan nearest to positions (F, 2) in bearing end behind them."""
     beams = recording.beams_of(scan)
     points = recording.points[beams].astype(np.float64)
@@ -165,8 +159,6 @@ def _is_free(recording: Recording, scan: int, T_map_sensor: Float, xy: Float) ->
     close = np.take_along_axis(error, nearest, axis=1).max(axis=1) <= _MAX_BEARING_ERROR
     return np.asarray(close & (r[nearest].min(axis=1) > np.hypot(*position.T) + _RANGE_JUMP))
 
-
-Mask = NDArray[np.bool_]
 
 _DETECTION_STD = 0.1  # m, of a detection from the middle of its person: legs swing
 _ACCELERATION = 0.5  # m2/s3, spectral density of random acceleration
@@ -198,10 +190,10 @@ class Tracks(NamedTuple):
     track: Index
     scan: Index
     xy: Float
-    observed: Mask
-    changed: Mask
+    observed: Bool
+    changed: Bool
 
-    def select(self, chosen: Mask) -> "Tracks":
+    def select(self, chosen: Bool) -> "Tracks":
         """Some of the entries."""
         return Tracks._make(column[chosen] for column in self)
 
@@ -219,15 +211,15 @@ class _ActiveTracks(NamedTuple):
     states: TrackStates
     track: Index
     last_seconds: Float
-    observed: Mask
-    changed: Mask
+    observed: Bool
+    changed: Bool
 
-    def select(self, chosen: Mask) -> "_ActiveTracks":
+    def select(self, chosen: Bool) -> "_ActiveTracks":
         rest = (column[chosen] for column in self[1:])
         return _ActiveTracks._make([self.states.select(chosen), *rest])
 
 
-def gate(states: TrackStates, xy: Float) -> NDArray[np.bool_]:
+def gate(states: TrackStates, xy: Float) -> Bool:
     """(K, F) detections (F, 2) within the gate of each predicted track."""
     innovation = xy[None] - states.x[:, None]
     S = states.P[:, 0] + _DETECTION_STD**2
@@ -272,7 +264,7 @@ def update_pda(states: TrackStates, xy: Float, beta: Float) -> TrackStates:
     return TrackStates(states.x + gain_x[:, None] * mean, states.v + gain_v[:, None] * mean, P)
 
 
-def track_people(detections: Detections, changed: Mask, seconds: Float) -> Tracks:
+def track_people(detections: Detections, changed: Bool, seconds: Float) -> Tracks:
     """The tracks of people, each from its start to its last detection.
 
     Args:
@@ -296,7 +288,7 @@ def track_people(detections: Detections, changed: Mask, seconds: Float) -> Track
     return tracks.select(person[tracks.track] & (tracks.scan <= last[tracks.track]))
 
 
-def _track_all(detections: Detections, changed: Mask, seconds: Float) -> Tracks:
+def _track_all(detections: Detections, changed: Bool, seconds: Float) -> Tracks:
     """All tracks, of people or not."""
     of_scan = np.searchsorted(detections.scan, np.arange(len(seconds) + 1))
     active = _start_tracks(np.zeros((0, 2)), np.zeros(0, bool), 0, 0.0)
@@ -316,7 +308,7 @@ def _track_all(detections: Detections, changed: Mask, seconds: Float) -> Tracks:
 
 
 def _update_tracks(
-    active: _ActiveTracks, predicted: TrackStates, xy: Float, changed: Mask, now: float
+    active: _ActiveTracks, predicted: TrackStates, xy: Float, changed: Bool, now: float
 ) -> _ActiveTracks:
     """Predicted tracks after the detections (F, 2) of a scan."""
     beta = association_probabilities(predicted, xy)
@@ -330,7 +322,7 @@ def _update_tracks(
     )
 
 
-def _start_tracks(xy: Float, changed: Mask, first_number: int, now: float) -> _ActiveTracks:
+def _start_tracks(xy: Float, changed: Bool, first_number: int, now: float) -> _ActiveTracks:
     """A new track at each detection (N, 2)."""
     n = len(xy)
     states = kalman.initialize(xy, _DETECTION_STD)
@@ -348,7 +340,7 @@ def _entries(active: _ActiveTracks, scan: int) -> Tracks:
     return Tracks(active.track, scans, active.states.x, active.observed, active.changed)
 
 
-def label_people(recording: Recording, poses: Float) -> NDArray[np.bool_]:
+def label_people(recording: Recording, poses: Float) -> Bool:
     """(M,) hits within the box of a tracked person.
 
     Args:
@@ -362,9 +354,7 @@ def label_people(recording: Recording, poses: Float) -> NDArray[np.bool_]:
     return find_beams_in_boxes(recording, T_map_sensor, track_people(detections, changed, seconds))
 
 
-def find_beams_in_boxes(
-    recording: Recording, T_map_sensor: Float, tracks: Tracks
-) -> NDArray[np.bool_]:
+def find_beams_in_boxes(recording: Recording, T_map_sensor: Float, tracks: Tracks) -> Bool:
     """(M,) hits within boxes around tracks, along the axes of the map."""
     inside = recording.allocate_per_beam(np.bool_)
     for block in iter_blocks(inside):

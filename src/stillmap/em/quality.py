@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.chunks import iter_beams
 from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
@@ -27,7 +28,7 @@ from stillmap.core.tiles import (
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import BLOCK_CELLS, OccupancyMap
 from stillmap.em.options import EmOptions
-from stillmap.em.types import DYNAMIC_BELOW, Float, NoReturnModel
+from stillmap.em.types import DYNAMIC_BELOW, NoReturnModel
 
 MIN_OBSERVATIONS = 3  # unobstructed observations of a well-observed cell
 MOVER_RADIUS = 0.3  # m around a dynamic end point within which observations are obstructed
@@ -58,7 +59,7 @@ class Coverage(ShortRepr):
 
     observations: NDArray[np.uint16]
     unobstructed: NDArray[np.uint16]
-    thinly_observed: NDArray[np.bool_]
+    thinly_observed: Bool
     min_observations: int
     mover_radius: float
 
@@ -66,7 +67,7 @@ class Coverage(ShortRepr):
 def count_observations(
     recording: Recording,
     poses: Float,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
     occupancy: OccupancyMap,
     no_return: NoReturnModel | None,
     options: EmOptions,
@@ -124,7 +125,7 @@ def _dense_counts(
     return observations, unobstructed, thin
 
 
-def select_held_out_scans(n_scans: int, every: int) -> NDArray[np.bool_]:
+def select_held_out_scans(n_scans: int, every: int) -> Bool:
     """(T,) mask of held-out scans: the middle one of every `every`; 0: none."""
     if every == 0:
         return np.zeros(n_scans, dtype=np.bool_)
@@ -132,12 +133,7 @@ def select_held_out_scans(n_scans: int, every: int) -> NDArray[np.bool_]:
 
 
 def score_held_out_scans(
-    recording: Recording,
-    poses: Float,
-    e: NDArray[np.float32],
-    resolution: float,
-    every: int,
-    threads: int = 1,
+    recording: Recording, poses: Float, e: Float32, resolution: float, every: int, threads: int = 1
 ) -> float | None:
     """Log likelihood of held-out ranges given the map of the other scans, in nats per beam.
 

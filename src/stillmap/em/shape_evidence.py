@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.arrays import finite_rows
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.mixture import MAX_FIT_ROWS
-from stillmap.em.types import MIN_PROBABILITY, Float
-
-Index = NDArray[np.intp]
+from stillmap.em.types import MIN_PROBABILITY
 
 _LINK, _LINK_PER_METRE = 0.35, 0.02  # m between neighbours of one segment; more per metre of range
 _WIDTHS = np.array([0.15, 0.35, 0.6, 0.9, 1.5])  # m: a leg, two, a person, a desk, a car
@@ -27,9 +26,7 @@ _BOTH_FARTHER, _ONE_FARTHER, _BOTH_NEARER, _UNKNOWN = range(4)
 N_SEGMENT_TYPES = 4 * (len(_WIDTHS) + 1)
 
 
-def find_lost_beams(
-    hit: NDArray[np.bool_], points: NDArray[np.float32], scan: Index
-) -> NDArray[np.bool_]:
+def find_lost_beams(hit: Bool, points: Float32, scan: Index) -> Bool:
     """(M,) beams without a return, fewer than three side by side: they may have been lost.
 
     Args:
@@ -78,9 +75,7 @@ def classify_segments(data: ScanBeams) -> NDArray[np.int8]:
     return types
 
 
-def _depth_order(
-    scan: Index, depth: NDArray[np.float64], first: Index, last: Index
-) -> NDArray[np.intp]:
+def _depth_order(scan: Index, depth: Float, first: Index, last: Index) -> Index:
     """(S,) what is beside the ends of S segments, from beam `first` to beam `last` of all."""
     farther, known = np.zeros((2, 2, len(first)), np.bool_)
     for side, (end, beside) in enumerate(((first, first - 1), (last, last + 1))):
@@ -120,18 +115,14 @@ class ShapeEvidence:
     """
 
     def __init__(
-        self,
-        surfel_map: _core.SurfelMap2D,
-        recording: Recording,
-        poses: Float,
-        threads: int = 1,
+        self, surfel_map: _core.SurfelMap2D, recording: Recording, poses: Float, threads: int = 1
     ) -> None:
         self._surfel_map, self._threads = surfel_map, threads
         self._segments = count_segments(surfel_map, recording, poses, threads)
-        self._support: NDArray[np.intp] | None = None
+        self._support: Index | None = None
         self.factors = np.ones((surfel_map.size, 2), np.float32)
 
-    def fit(self, p_static: NDArray[np.float32], p_view_dependent: NDArray[np.float32]) -> None:
+    def fit(self, p_static: Float32, p_view_dependent: Float32) -> None:
         """Learns from P(static) and P(view-dependent) (E,) by history and the factors before.
 
         Lines of static surface count from the second time on: the first labels lack all shapes.
@@ -149,7 +140,7 @@ class ShapeEvidence:
 
 def count_segments(
     surfel_map: _core.SurfelMap2D, recording: Recording, poses: Float, threads: int = 1
-) -> NDArray[np.float32]:
+) -> Float32:
     """(E, N_SEGMENT_TYPES) share of each type of segment among the beams that end on a surfel."""
     counts = np.zeros((surfel_map.size, N_SEGMENT_TYPES), np.float32)
     for *_, data in iter_beams(recording, poses):
@@ -161,9 +152,7 @@ def count_segments(
     return counts
 
 
-def _classify_support(
-    surfel_map: _core.SurfelMap2D, p_static: NDArray[np.float32], threads: int
-) -> NDArray[np.intp]:
+def _classify_support(surfel_map: _core.SurfelMap2D, p_static: Float32, threads: int) -> Index:
     """(E,) class of the length of static surface on the best line through each surfel."""
     cell = surfel_map.resolution
     radius = min(max(_RADIUS / cell, 1.0), _MAX_RADIUS)
@@ -178,11 +167,7 @@ def _classify_support(
     return np.searchsorted(_SUPPORT, cell * support.astype(np.float64), side="right")
 
 
-def _fit_shapes(
-    history: Float,
-    segments: NDArray[np.float32],
-    support: NDArray[np.intp],
-) -> Float:
+def _fit_shapes(history: Float, segments: Float32, support: Index) -> Float:
     """(E, G) tempered ln P(shape | group) / P(shape | first group) of G groups of surfels.
 
     EM over the frequencies of shapes, pairs of a class of support and a type of segment, in each
@@ -225,7 +210,7 @@ def _compare(counts: Float, pseudo: Float) -> Float:
     return np.asarray(np.log(ratio))
 
 
-def _temper(shares: NDArray[np.float32], log_ratio: Float) -> Float:
+def _temper(shares: Float32, log_ratio: Float) -> Float:
     """(K, G) mean log ratio by the shares (K, N), tempered, within bounds."""
     out = _TEMPER * np.einsum("ek,gk->eg", shares, log_ratio)
     return np.asarray(np.clip(out, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))

@@ -7,13 +7,13 @@ together. `docs/estimator.md` has the equations.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Int32
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.observations import iter_surfel_rows
-from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY, Float, GroundMap
+from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY, GroundMap
 
 _MEAN_FIELD = {
     "radius": 2.5,  # voxels
@@ -38,8 +38,8 @@ _CLEARANCE_STD = 2.5  # the same in noise_std; the larger of the two counts
 
 
 def smooth_mean_field(
-    p_static: NDArray[np.float32], surfel_map: _core.SurfelMap3D, threads: int = 1
-) -> NDArray[np.float32]:
+    p_static: Float32, surfel_map: _core.SurfelMap3D, threads: int = 1
+) -> Float32:
     """(E,) P(static) of each surfel given its own observations and its neighbours.
 
     Args:
@@ -74,10 +74,10 @@ class ObstacleSurfels:
     """
 
     surfel_map: _core.SurfelMap3D
-    is_obstacle: NDArray[np.bool_]
-    is_ground: NDArray[np.bool_]
-    was_dynamic: NDArray[np.bool_]
-    ground_height: NDArray[np.float32]
+    is_obstacle: Bool
+    is_ground: Bool
+    was_dynamic: Bool
+    ground_height: Float32
     column_cells: int
 
     @property
@@ -86,12 +86,8 @@ class ObstacleSurfels:
         return _clearance(self.surfel_map)
 
     def label_ground_contact(
-        self,
-        p_static: NDArray[np.float32],
-        data: ScanBeams,
-        surfel: NDArray[np.int32],
-        threads: int = 1,
-    ) -> NDArray[np.float32]:
+        self, p_static: Float32, data: ScanBeams, surfel: Int32, threads: int = 1
+    ) -> Float32:
         """(M,) P(static) of the mover above each end point near the ground; NaN: none.
 
         Args:
@@ -138,8 +134,8 @@ def _clearance(surfel_map: _core.SurfelMap3D) -> float:
 
 
 def label_far_ground(
-    p_static: NDArray[np.float32], obstacles: ObstacleSurfels
-) -> tuple[NDArray[np.float32], ObstacleSurfels]:
+    p_static: Float32, obstacles: ObstacleSurfels
+) -> tuple[Float32, ObstacleSurfels]:
     """Raise P(static) of the surfels on the ground to at least their mean.
 
     Far away the rings of a lidar lie metres apart on the ground: no plane can be fitted, and as the
@@ -163,13 +159,13 @@ def label_far_ground(
 
 
 def pool_clusters(
-    p_static: NDArray[np.float32],
-    change: NDArray[np.float32],
+    p_static: Float32,
+    change: Float32,
     obstacles: ObstacleSurfels,
     recording: Recording,
     poses: Float,
     threads: int = 1,
-) -> NDArray[np.float32]:
+) -> Float32:
     """(E,) P(static), lowered for surfels of clusters that move, arrived or left.
 
     Args:
@@ -192,9 +188,7 @@ def pool_clusters(
     return apply_pooled_evidence(p_static, pooling.means())
 
 
-def apply_pooled_evidence(
-    p_static: NDArray[np.float32], means: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def apply_pooled_evidence(p_static: Float32, means: Float32) -> Float32:
     """(E,) log odds = min(own, -min(20 max(a - 0.3, b - 1), 4)).
 
     Args:

@@ -3,13 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Int32, Int64
 from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
-
-Float = NDArray[np.float64]
 
 Grid = _core.OccupancyGrid2D | _core.OccupancyGrid3D
 
@@ -43,8 +41,8 @@ class CellProbabilities(ShortRepr):
         free_prior: occupancy probability of every other cell before beams passed through it.
     """
 
-    cells: NDArray[np.int64]
-    p_occupied: NDArray[np.float32]
+    cells: Int64
+    p_occupied: Float32
     free_prior: float
 
 
@@ -57,7 +55,7 @@ class NoReturnModel(ShortRepr):
         end_margin: metres before its end from which on it shows nothing; inf: it shows nothing.
     """
 
-    stop_cells: NDArray[np.int64]
+    stop_cells: Int64
     end_margin: float
 
 
@@ -73,12 +71,12 @@ class ChangedCells(ShortRepr):
             the last change; -1: there was none.
     """
 
-    cells: NDArray[np.int64]
-    p_object: NDArray[np.float32]
-    n_changes: NDArray[np.int32]
-    change_bins: NDArray[np.int32]
+    cells: Int64
+    p_object: Float32
+    n_changes: Int32
+    change_bins: Int32
 
-    def select(self, kept: NDArray[np.bool_]) -> "ChangedCells":
+    def select(self, kept: Bool) -> "ChangedCells":
         """Some of the cells."""
         return ChangedCells(
             self.cells[kept], self.p_object[kept], self.n_changes[kept], self.change_bins[kept]
@@ -127,7 +125,7 @@ class EStepResult(ShortRepr):
         ground: height of the ground, in 3D where the estimator needs it.
     """
 
-    p_static: NDArray[np.float32]
+    p_static: Float32
     likelihood: Likelihood
     occupied: CellProbabilities | None = None
     learned: dict[str, object] = field(default_factory=dict)
@@ -147,9 +145,7 @@ class EStepResult(ShortRepr):
         return self.occupied
 
 
-def fill_beams(
-    points: NDArray[np.float32], hit: NDArray[np.bool_], values: NDArray[np.float32], prior: float
-) -> NDArray[np.float32]:
+def fill_beams(points: Float32, hit: Bool, values: Float32, prior: float) -> Float32:
     """(M,) `values` for hits, the prior for maximum-range beams, NaN for unusable ones."""
     e = np.where(hit, values, np.float32(prior)).astype(np.float32, copy=False)
     e[~finite_rows(points)] = np.nan

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Index
 from stillmap.live.local_map import SpacedView
 from stillmap.slam.loop_candidates import MIN_LOOP_TRAVEL
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.loop_verification import CLOSURE_ROTATION, CLOSURE_TRANSLATION, SUBMAP_TRAVEL
-from stillmap.slam.types import Index, LoopClosure
+from stillmap.slam.types import LoopClosure
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]

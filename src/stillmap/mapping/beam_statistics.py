@@ -1,14 +1,14 @@
 """Counts and samples over all beams, block by block: recordings may be larger than memory."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 
 
-def count_beams(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:
+def count_beams(recording: Recording, p_static: Float32) -> dict[str, int]:
     """Count `beams`, `hits`, `max_range`, `unusable`, and `dynamic` (hits with p_static < 0.5)."""
     hits = unusable = dynamic = 0
     for block in iter_blocks(recording.points, recording.hit, p_static):
@@ -27,11 +27,8 @@ def count_beams(recording: Recording, p_static: NDArray[np.float32]) -> dict[str
 
 
 def sample_dynamic_points(
-    recording: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
-    limit: int = 200_000,
-) -> NDArray[np.float64]:
+    recording: Recording, poses: Float, p_static: Float32, limit: int = 200_000
+) -> Float:
     """Sample the end points, in the map frame, of the hits with p_static < 0.5.
 
     Args:
@@ -47,22 +44,18 @@ def sample_dynamic_points(
 
 
 def sample_static_points(
-    recording: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32], limit: int
-) -> NDArray[np.float64]:
+    recording: Recording, poses: Float, p_static: Float32, limit: int
+) -> Float:
     """Those of the hits with p_static >= 0.5; arguments as of `sample_dynamic_points`."""
     return _sample_points(recording, poses, p_static, limit, False)
 
 
 def _sample_points(
-    recording: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
-    limit: int,
-    dynamic: bool,
-) -> NDArray[np.float64]:
+    recording: Recording, poses: Float, p_static: Float32, limit: int, dynamic: bool
+) -> Float:
     arrays = recording.hit, p_static
 
-    def is_chosen(block: slice) -> NDArray[np.bool_]:
+    def is_chosen(block: slice) -> Bool:
         moves = p_static[block] < DYNAMIC_BELOW
         return recording.hit[block] & (moves if dynamic else ~moves)
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Cells, Float, Index, Int32, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
@@ -15,10 +15,6 @@ from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
 from stillmap.mapping.doors import Door
 from stillmap.mapping.mover_points import MoverPoints, is_explained
 
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
-Stamps = NDArray[np.int64]
-Index = NDArray[np.intp]
 Kind = Literal["came", "left", "comes and goes", "door"]
 
 _MIN_PROBABILITY = 0.5  # that a cell changed
@@ -139,10 +135,10 @@ class _BinStamps:
         self._number = time_bin_index(recording, time_bin)
         self._stamp_ns = recording.stamp_ns
 
-    def first(self, bins: NDArray[np.int32]) -> NDArray[np.int64]:
+    def first(self, bins: Int32) -> Int64:
         return self._stamp_ns[np.searchsorted(self._number, bins)]
 
-    def last(self, bins: NDArray[np.int32]) -> NDArray[np.int64]:
+    def last(self, bins: Int32) -> Int64:
         return self._stamp_ns[np.searchsorted(self._number, bins, side="right") - 1]
 
 
@@ -150,9 +146,9 @@ class _Events(NamedTuple):
     """N changes of single cells: which cell, came or left, and between which stamps in ns."""
 
     cell: Index
-    came: NDArray[np.bool_]
-    before: NDArray[np.int64]
-    after: NDArray[np.int64]
+    came: Bool
+    before: Int64
+    after: Int64
 
     def select(self, chosen: Index) -> "_Events":
         return _Events._make(column[chosen] for column in self)
@@ -171,7 +167,7 @@ def _make_events(changed: ChangedCells, cells: Index, stamps: _BinStamps) -> _Ev
 
 def _explained_recurring(
     changed: ChangedCells, stamps: _BinStamps, resolution: float, movers: MoverPoints
-) -> NDArray[np.bool_]:
+) -> Bool:
     """(K,) whether the first or the last change of a cell is explained."""
     xy = np.asarray((changed.cells + 0.5) * resolution, np.float64)
     bins = np.maximum(changed.change_bins, 0)
@@ -300,11 +296,7 @@ _DWELL_QUANTILE = 0.25  # of the observed times of an object's voxels
 
 
 def detect_changes_3d(
-    changed: ChangedCells,
-    recording: Recording,
-    poses: NDArray[np.float64],
-    resolution: float,
-    time_bin: float,
+    changed: ChangedCells, recording: Recording, poses: Float, resolution: float, time_bin: float
 ) -> list[Change]:
     """Changed places that are objects at rest: high, large and present for long enough.
 
@@ -344,7 +336,7 @@ def _select_lasting(changed: ChangedCells, min_bins: float, bins: float) -> Chan
 
 
 def measure_dwell_times(
-    places: Sequence[Change], recording: Recording, poses: NDArray[np.float64], resolution: float
+    places: Sequence[Change], recording: Recording, poses: Float, resolution: float
 ) -> list[float]:
     """Seconds for which three quarters of each object's voxels were hit while it stood there.
 

@@ -5,10 +5,10 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
@@ -17,23 +17,19 @@ from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import find_shown_cells, is_same_place
 from stillmap.mapping.doors import Door, fit_sector
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-Labels = NDArray[np.float32]
-
 _EVER = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # stamps
 
 
 def relabel_changes(
     recording: Recording,
     poses: Float,
-    p_static: Labels,
+    p_static: Float32,
     occupied: em.CellProbabilities,
     histories: em.CellHistories,
     changes: list[Change],
     state: em.MapState,
     threads: int = 1,
-) -> tuple[Labels, em.CellProbabilities]:
+) -> tuple[Float32, em.CellProbabilities]:
     """Labels (M,) and map cells, taken from the cell histories within the listed changes.
 
     There p_static of a beam is the probability that the map in this state shows the object that
@@ -68,7 +64,7 @@ def relabel_changes(
 def find_changed_object_beams(
     recording: Recording,
     poses: Float,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
     changes: list[Change],
     doors: list[Door],
     resolution: float,
@@ -104,15 +100,15 @@ class _Stay(NamedTuple):
 
     since: int
     until: int
-    low: NDArray[np.int64]
-    mask: NDArray[np.bool_]
+    low: Int64
+    mask: Bool
 
     @classmethod
     def from_change(cls, change: Change, changes: list[Change]) -> "_Stay":
         return cls.around_cells(change.cells, _stay_span(change, changes))
 
     @classmethod
-    def around_cells(cls, cells: NDArray[np.int64], span: tuple[int, int]) -> "_Stay":
+    def around_cells(cls, cells: Int64, span: tuple[int, int]) -> "_Stay":
         """In cells (K, 2) and those around them, in a span of stamps."""
         low, high = cells.min(axis=0) - 1, cells.max(axis=0) + 2
         mask = np.zeros(tuple((high - low).tolist()), bool)
@@ -120,7 +116,7 @@ class _Stay(NamedTuple):
             mask[tuple((cells - low + (i, j)).T)] = True
         return cls(*span, low, mask)
 
-    def bounds(self, cells: NDArray[np.int64], stamp: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def bounds(self, cells: Int64, stamp: Int64) -> Bool:
         """(n,) whether cells (n, 2) at stamps (n,) lie within the mask's box during the stay."""
         inside = ((cells >= self.low) & (cells < self.low + self.mask.shape)).all(axis=1)
         return np.asarray(inside & (stamp > self.since) & (stamp <= self.until))
@@ -147,8 +143,8 @@ _STRAY_SHARE = 0.15  # of the time, of readings where nothing stands
 def update_occupancy(
     recording: Recording,
     poses: Float,
-    before: Labels,
-    after: Labels,
+    before: Float32,
+    after: Float32,
     histories: em.CellHistories,
     occupied: em.CellProbabilities,
     threads: int = 1,

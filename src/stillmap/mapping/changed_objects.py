@@ -3,15 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em
+from stillmap.core.array_types import Bool, Cells, Float, Float32, Index
 from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.doors import is_row
-
-Cells = NDArray[np.int64]
-Index = NDArray[np.intp]
 
 _RADIUS = 3.0  # cells between cells of a recurring change that decide together
 _MIN_WEIGHT = 1e-3
@@ -26,9 +23,9 @@ class ShownCells(NamedTuple):
         p_leaf: (E,) float32, probability that it is the leaf of a door, in any position.
     """
 
-    listed: NDArray[np.bool_]
-    p_in_map: NDArray[np.float32]
-    p_leaf: NDArray[np.float32]
+    listed: Bool
+    p_in_map: Float32
+    p_leaf: Float32
 
 
 def find_shown_cells(
@@ -53,7 +50,7 @@ def find_shown_cells(
     return ShownCells(listed, p, p_leaf)
 
 
-def _weigh_leaves(keys: Cells, changes: list[Change]) -> NDArray[np.float32]:
+def _weigh_leaves(keys: Cells, changes: list[Change]) -> Float32:
     """(E,) probability that what changed in the cells with these keys is the leaf of a door.
 
     A straight row of cells that changed may be a leaf that was seen in one position only, or one
@@ -69,9 +66,7 @@ def _weigh_leaves(keys: Cells, changes: list[Change]) -> NDArray[np.float32]:
     return out
 
 
-def pool_states(
-    histories: em.CellHistories, changes: list[Change], state: em.MapState
-) -> NDArray[np.float32]:
+def pool_states(histories: em.CellHistories, changes: list[Change], state: em.MapState) -> Float32:
     """(E,) `share_there` of each cell, the same in all cells of an object.
 
     Each cell was observed at times of its own, so that the modal state of an object that was moved
@@ -107,9 +102,7 @@ def _rows(keys: Cells, cells: Cells) -> Index:
     return np.flatnonzero(np.isin(keys, cell_keys(cells)))
 
 
-def _local_mean(
-    cells: Cells, share: NDArray[np.float32], weight: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _local_mean(cells: Cells, share: Float32, weight: Float) -> Float:
     """(K,) weighted mean of the share (K,) of the cells (K, 2) within a radius of each."""
     pairs = neighbor_pairs(cells, _RADIUS)
     one, other = np.concatenate([pairs, pairs[:, ::-1]]).T

@@ -6,17 +6,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Cells, Float
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door_states import is_passage_observed, observe_states
 from stillmap.mapping.doors import Door, Sector, fit_sector
 from stillmap.mapping.resting_leaf import find_resting_leaf
-
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
 
 _MAX_TIME_GAP = 2.0  # s between the departure from one position and the arrival in the other
 _REACH = 0.5  # m between the cells of both positions, which have the hinge in common

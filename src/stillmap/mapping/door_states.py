@@ -5,16 +5,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Cells, Float, Index, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import group_indices
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.doors import Door, DoorState, Position
-
-Float = NDArray[np.float64]
-Cells = NDArray[np.int64]
 
 _BIN_NS = 10**9  # in which the cells that were hit make one observation
 # share of the cells of a leaf that are hit in an observation: who walks through hits fewer
@@ -44,7 +41,7 @@ def observe_states(
         resolution: m, edge of a cell.
     """
     masks = [_LeafMask.of_door(door) for door in doors]
-    seen: list[list[NDArray[np.int64]]] = [[np.empty((0, 2), np.int64)] for _ in doors]
+    seen: list[list[Int64]] = [[np.empty((0, 2), np.int64)] for _ in doors]
     for block in iter_blocks(recording.hit) if doors else ():
         beam = block.start + np.flatnonzero(recording.hit[block])
         scan = recording.scans_of(beam)
@@ -61,7 +58,7 @@ def observe_states(
 
 def observe_looks(
     leaves: Sequence[Cells], recording: Recording, poses: Float, resolution: float
-) -> list[NDArray[np.int64]]:
+) -> list[Int64]:
     """(L, 2) stamps of the first and the last scan of each second that saw a leaf.
 
     Args:
@@ -86,9 +83,7 @@ def observe_looks(
     ]
 
 
-def _list_looks(
-    stamp_ns: NDArray[np.int64], scan: NDArray[np.int64], cell: NDArray[np.int64], least: float
-) -> NDArray[np.int64]:
+def _list_looks(stamp_ns: Int64, scan: Int64, cell: Int64, least: float) -> Int64:
     """(L, 2) first and last stamp of the seconds in which that many cells were hit."""
     stamps = stamp_ns[scan]
     looks = [
@@ -106,7 +101,7 @@ class _LeafMask(NamedTuple):
     """
 
     low: Cells
-    number: NDArray[np.int64]
+    number: Int64
     n_shut: int
     n_open: int
 
@@ -118,7 +113,7 @@ class _LeafMask(NamedTuple):
         number[tuple((cells - low).T)] = np.arange(len(cells))
         return cls(low, number, len(door.shut_cells), len(door.open_cells))
 
-    def find(self, cells: Cells) -> NDArray[np.int64]:
+    def find(self, cells: Cells) -> Int64:
         """(N,) the numbers of cells (N, 2)."""
         out = np.full(len(cells), -1, np.int64)
         inside = ((cells >= self.low) & (cells < self.low + self.number.shape)).all(axis=1)
@@ -126,9 +121,7 @@ class _LeafMask(NamedTuple):
         return out
 
 
-def _list_states(
-    mask: _LeafMask, hits: NDArray[np.int64], stamp_ns: NDArray[np.int64]
-) -> tuple[DoorState, ...]:
+def _list_states(mask: _LeafMask, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
     out: list[DoorState] = []
     looks, contradicted = {"shut": 0, "open": 0}, 0
@@ -167,9 +160,7 @@ def is_passage_observed(door: Door, recording: Recording, poses: Float) -> bool:
     return False
 
 
-def observe_passages(
-    ends: Float, looks: NDArray[np.int64], recording: Recording, poses: Float
-) -> NDArray[np.intp]:
+def observe_passages(ends: Float, looks: Int64, recording: Recording, poses: Float) -> Index:
     """(n,) scans whose beams passed through a leaf while nothing was seen there.
 
     None where fewer than three did, or where the leaf was never seen. At most 500 scans are looked
@@ -191,9 +182,7 @@ def observe_passages(
     return scans if len(scans) >= _MIN_CROSSING else scans[:0]
 
 
-def measure_slope(
-    ends: Float, looks: NDArray[np.int64], recording: Recording, poses: Float
-) -> float:
+def measure_slope(ends: Float, looks: Int64, recording: Recording, poses: Float) -> float:
     """Slope of the surface that was hit in some looks along a leaf, against it; NaN: none was.
 
     Args:
@@ -213,9 +202,7 @@ def measure_slope(
     return float((x @ y) / max(x @ x, np.finfo(np.float64).tiny))
 
 
-def list_runs(
-    position: Position, looks: NDArray[np.int64], passages: NDArray[np.int64]
-) -> tuple[DoorState, ...]:
+def list_runs(position: Position, looks: Int64, passages: Int64) -> tuple[DoorState, ...]:
     """States of a leaf seen in one position in looks (L, 2), and not there at stamps (n,)."""
     other: Position = "shut" if position == "open" else "open"
     seen = [DoorState(position, first, last) for first, last in looks.tolist()]
@@ -227,7 +214,7 @@ def list_runs(
     return tuple(out)
 
 
-def _scans_during(door: Door, position: Position, stamp_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+def _scans_during(door: Door, position: Position, stamp_ns: Int64) -> Index:
     """Scans in the states of that position, thinned evenly where there are many."""
     inside = np.zeros(len(stamp_ns), bool)
     for one in door.states:
@@ -236,22 +223,18 @@ def _scans_during(door: Door, position: Position, stamp_ns: NDArray[np.int64]) -
     return _thin(np.flatnonzero(inside))
 
 
-def _thin(scans: NDArray[np.intp]) -> NDArray[np.intp]:
+def _thin(scans: Index) -> Index:
     """At most `_MAX_SCANS` of them, evenly."""
     return scans[:: -(-len(scans) // _MAX_SCANS) or 1]
 
 
-def find_hit_cells(
-    scans: NDArray[np.intp], recording: Recording, poses: Float, resolution: float
-) -> Cells:
+def find_hit_cells(scans: Index, recording: Recording, poses: Float, resolution: float) -> Cells:
     """(n, 2) cells in which the beams of some scans ended."""
     beam, _ = _list_hits(scans, recording)
     return np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)
 
 
-def _list_hits(
-    scans: NDArray[np.intp], recording: Recording
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _list_hits(scans: Index, recording: Recording) -> tuple[Index, Index]:
     """(n,) beams of some scans that hit something, and which of these scans they are of."""
     first, count = recording.offset[scans], np.diff(recording.offset)[scans]
     of = np.repeat(np.arange(len(scans)), count)
@@ -260,9 +243,7 @@ def _list_hits(
     return beam[hit], of[hit]
 
 
-def _find_crossing(
-    ends: Float, scans: NDArray[np.intp], recording: Recording, poses: Float
-) -> NDArray[np.intp]:
+def _find_crossing(ends: Float, scans: Index, recording: Recording, poses: Float) -> Index:
     """Those of some scans of which a beam crosses the segment between ends (2, 2) and goes on."""
     beam, of = _list_hits(scans, recording)
     T = recording.T_map_sensor(poses)[scans]
@@ -272,7 +253,7 @@ def _find_crossing(
     beyond = _cross(b - a, end - a) * np.sign(_cross(b - a, start - a))
     # by so far that noise does not reach back
     passes = (side.prod(axis=0) < 0.0) & (beyond < -_GOES_ON * np.linalg.norm(b - a))
-    crossing: NDArray[np.intp] = scans[np.unique(of[passes])]
+    crossing: Index = scans[np.unique(of[passes])]
     return crossing
 
 

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Cells, Float, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em.options import MapState
-
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
 
 _TOLERANCE = 2.0  # cells between the leaf and a cell on it
 _MAX_WIDTH, _MIN_ELONGATION = 2.0 * _TOLERANCE + 1.0, 3.0  # of a straight row: cells; of its width
@@ -55,7 +52,7 @@ class Sector:
         around = self.hinge + np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
         return np.asarray(around[self.contains(around)])
 
-    def nearer_ends(self, cells: Cells) -> NDArray[np.intp]:
+    def nearer_ends(self, cells: Cells) -> Index:
         """(N,) end position, 0 or 1, nearer to each of cells (N, 2); -1: farther than the leaf."""
         distance, turned = self._relative_polar(cells)
         off = np.abs(turned[:, None] - [self._low, self._high])
@@ -71,7 +68,7 @@ class Sector:
         distance, angle = self._polar(cells)
         return distance, np.asarray(np.angle(np.exp(1j * (angle - self._mean))))
 
-    def contains(self, cells: Cells) -> NDArray[np.bool_]:
+    def contains(self, cells: Cells) -> Bool:
         """(N,) whether the leaf sweeps over cells (N, 2)."""
         distance, turned = self._relative_polar(cells)
         between = (turned >= self._low) & (turned <= self._high)

@@ -4,11 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from stillmap.core.array_types import Cells, Float, Index
 
 _DIRECTIONS = 60  # of half a turn, of which walls may have some
 _MIN_WALL, _MIN_SHARE = 0.5, 0.05  # m of a wall; of the direction that has most

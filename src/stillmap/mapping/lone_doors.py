@@ -9,11 +9,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import arrays
+from stillmap.core.array_types import Cells, Float, Float32, Index, Int64
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.changed_objects import cell_keys
@@ -34,16 +34,13 @@ from stillmap.mapping.shut_leaves import (
     find_shut_leaf,
 )
 
-Float = NDArray[np.float64]
-
-
 _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
 _WATCHED = 2.0  # s between two looks within which a swing would have been seen
 _LEAST = 1e-3  # s that a swing takes
 
 
 def compute_p_moved(
-    doors: Sequence[Door], looks: Sequence[NDArray[np.int64]], stamp_ns: NDArray[np.int64]
+    doors: Sequence[Door], looks: Sequence[Int64], stamp_ns: Int64
 ) -> tuple[Float, Float]:
     """Probability that each of some doors was in the same position at all looks, (K,), and if it
     was, that it moved while nobody saw it, (K,).
@@ -97,7 +94,7 @@ def _log_likelihood_of_swings(door: Door) -> Float:
     return np.asarray(np.log(differs).sum(axis=1) + np.log(same).sum(axis=1))
 
 
-def _split_looks(stamps: NDArray[np.int64]) -> tuple[float, Float]:
+def _split_looks(stamps: Int64) -> tuple[float, Float]:
     """Seconds in which a leaf was watched, and the gaps between them."""
     pauses = 1e-9 * (stamps[1:, 0] - stamps[:-1, 1]).astype(np.float64)
     watched = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum()) + float(
@@ -105,9 +102,6 @@ def _split_looks(stamps: NDArray[np.int64]) -> tuple[float, Float]:
     )
     return watched, pauses[pauses > _WATCHED]
 
-
-Cells = NDArray[np.int64]
-Labels = NDArray[np.float32]
 
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
 _P_PASSED = 27.0 / 28.0  # the same of shut ones that beams passed: 26 of 26 in nine offices
@@ -187,7 +181,7 @@ def _observe(
 ) -> list[Door]:
     """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
     looks = observe_looks([leaf.cells for leaf, _ in found], recording, poses, resolution)
-    passed_doors, lone_doors, lone_looks = list[Door](), list[Door](), list[NDArray[np.int64]]()
+    passed_doors, lone_doors, lone_looks = list[Door](), list[Door](), list[Int64]()
     for (leaf, is_open), seen in zip(found, looks, strict=True):
         if not len(seen):
             continue
@@ -206,12 +200,8 @@ def _observe(
 
 
 def _find_passages(
-    leaf: LoneLeaf,
-    looks: NDArray[np.int64],
-    recording: Recording,
-    poses: Float,
-    resolution: float,
-) -> tuple[LoneLeaf, NDArray[np.intp]]:
+    leaf: LoneLeaf, looks: Int64, recording: Recording, poses: Float, resolution: float
+) -> tuple[LoneLeaf, Index]:
     """A shut leaf without what is hit while beams pass through it, and the scans of these.
 
     What is hit then is the edge of a wall; where little else is left, it is no leaf that moved. Nor
@@ -231,10 +221,7 @@ def _find_passages(
 
 
 def _rate_lone(
-    lone: Sequence[Door],
-    looks: Sequence[NDArray[np.int64]],
-    swung: Sequence[Door],
-    stamp_ns: NDArray[np.int64],
+    lone: Sequence[Door], looks: Sequence[Int64], swung: Sequence[Door], stamp_ns: Int64
 ) -> list[Door]:
     """The doors seen in one position with P(moved), without those that hardly are doors."""
     is_open = np.array([len(one.open_cells) > 0 for one in lone], bool)
@@ -274,13 +261,13 @@ def _make_door(
 def relabel_lone_doors(
     recording: Recording,
     poses: Float,
-    p_static: Labels,
+    p_static: Float32,
     occupied: em.CellProbabilities,
     histories: em.CellHistories,
     doors: Sequence[Door],
     state: em.MapState,
     threads: int = 1,
-) -> tuple[Labels, em.CellProbabilities]:
+) -> tuple[Float32, em.CellProbabilities]:
     """Labels (M,) and map cells with doors whose leaf was seen in one position only.
 
     P(static) of a beam on a leaf that stood open, or that beams passed, is less by the probability

@@ -11,18 +11,15 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Cells, Float, Float32
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.doorways import Doorway
 from stillmap.mapping.resting_leaf import SurfaceField
-
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
 
 _ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
 _SHIFT = np.array([-0.5, 1.0])  # cells of the hinge into the doorway
@@ -156,10 +153,10 @@ class _Hypotheses(NamedTuple):
     leaf: Float
     angle: Float
     row: Float
-    is_near: NDArray[np.bool_]
-    is_on: NDArray[np.bool_]
+    is_near: Bool
+    is_on: Bool
 
-    def select(self, kept: NDArray[np.bool_]) -> "_Hypotheses":
+    def select(self, kept: Bool) -> "_Hypotheses":
         return _Hypotheses._make(column[kept] for column in self)
 
 
@@ -221,7 +218,7 @@ def _along(doorway: Doorway) -> Float:
     return np.arange(1.0, doorway.width + _LONGER[-1] + _BEYOND[1])
 
 
-def _score_leaves(every: _Hypotheses, aside: NDArray[np.bool_], t: Float, length: float) -> Float:
+def _score_leaves(every: _Hypotheses, aside: Bool, t: Float, length: float) -> Float:
     """(H,) score of the leaves of one length; 0 where there is none.
 
     Args:
@@ -259,7 +256,7 @@ _MIDDLE, _ANGLE = 4.0, 8  # cells, and parts of half a turn, by which lines of o
 
 
 def find_leaf_lines(
-    recording: Recording, poses: Float, p_static: NDArray[np.float32], resolution: float
+    recording: Recording, poses: Float, p_static: Float32, resolution: float
 ) -> list[Cells]:
     """Cells (K, 2) of each straight row of dynamic hits that may be a leaf.
 

@@ -10,13 +10,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Bool = NDArray[np.bool_]
-Float = NDArray[np.float64]
-
-
-Cells = NDArray[np.int64]
+from stillmap.core.array_types import Bool, Cells, Float, Index
 
 _MIN_HITS, _MIN_DYNAMIC_HITS = 2, 5  # in a cell with a surface; mirrors make some look dynamic
 _MAX_CELLS, _MAX_LINES = 10_000, 40
@@ -247,7 +242,7 @@ def _widen_to_back(mirror: Mirror, beams: Beams) -> Mirror:
     return replace(mirror, first=first, last=last)
 
 
-def _back_hits(mirror: Mirror, beams: Beams, first: float, last: float) -> NDArray[np.intp]:
+def _back_hits(mirror: Mirror, beams: Beams, first: float, last: float) -> Index:
     """(B,) returns from the back of a mirror's wall, in bins from first to last metre."""
     front = beams.ends @ mirror.normal - mirror.distance
     on = (front < 0.5 * _ON_LINE) & (front > -_MAX_THICKNESS)

@@ -4,10 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Stamps = NDArray[np.int64]
+from stillmap.core.array_types import Bool, Float, Int64
 
 _UNSEEN = 2.0  # s between two observations, during which something may move unseen
 _REACH = 1.0  # m between a mover and what it moves: half of a car that parks, an arm
@@ -24,7 +22,7 @@ class MoverPoints(NamedTuple):
     """
 
     xy: Float
-    stamp_ns: Stamps
+    stamp_ns: Int64
 
     @classmethod
     def none(cls) -> "MoverPoints":
@@ -44,9 +42,7 @@ class MoverPoints(NamedTuple):
         return MoverPoints(self.xy[some], self.stamp_ns[some])
 
 
-def is_explained(
-    xy: Float, before_ns: Stamps, after_ns: Stamps, movers: MoverPoints
-) -> NDArray[np.bool_]:
+def is_explained(xy: Float, before_ns: Int64, after_ns: Int64, movers: MoverPoints) -> Bool:
     """(K,) whether a change may be one: it was not in view then, or a mover was there.
 
     Args:

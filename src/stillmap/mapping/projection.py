@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.arrays import ArrayBuilder, unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
@@ -22,19 +22,13 @@ from stillmap.core.tiles import tiles_of
 from stillmap.em import GroundMap, OccupancyMap
 from stillmap.em.types import GROUND_SQUARE
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-
 DIRECTIONS = 2048  # of the beams of a scan; at 50 m 15 cm apart
 
 _SENSOR_MARGIN = 0.05  # m by which the band reaches above the sensor
 
 
 def make_planar_recording(
-    recording: Recording,
-    points: NDArray[np.float32],
-    hit: NDArray[np.bool_],
-    offset: NDArray[np.int64],
+    recording: Recording, points: Float32, hit: Bool, offset: Int64
 ) -> Recording:
     """The scans of a 3D recording with planar beams, of one sensor at the robot's center.
 
@@ -101,7 +95,7 @@ def project_to_plane(
     ends, hits = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
     numbers = ArrayBuilder(np.intp, (), scratch)
 
-    def process(t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], Index]:
+    def process(t: int) -> tuple[Float32, Bool, Index]:
         beams = recording.beams_of(t)
         xy, hit, number = _core.project_scan(
             recording.points[beams], recording.hit[beams], T_map_sensor[t], **settings

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.mirrors import (
@@ -27,9 +27,6 @@ from stillmap.mapping.mirrors import (
     tangent_of,
 )
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-
 _MAX_PASSES = 3
 _MAX_SAMPLE = 60_000  # beams, of whole scans, that mirrors are searched with
 P_REFLECTED = 0.02  # P(c = 1) of reflected beams
@@ -44,7 +41,7 @@ _MAX_TRIED = 1000  # beams that these are tried with
 
 
 def remove_reflections(
-    recording: Recording, poses: Float, p_static: NDArray[np.float32], resolution: float
+    recording: Recording, poses: Float, p_static: Float32, resolution: float
 ) -> tuple[Recording, Bool | None]:
     """The recording with the beams that mirrors reflected marked as unusable, and their mask (M,).
 
@@ -65,7 +62,7 @@ def remove_reflections(
 
 
 def find_mirrors(
-    recording: Recording, poses: Float, p_static: NDArray[np.float32], resolution: float
+    recording: Recording, poses: Float, p_static: Float32, resolution: float
 ) -> list[Mirror]:
     """The mirrors of a place.
 
@@ -102,7 +99,7 @@ def find_reflections(recording: Recording, poses: Float, mirrors: list[Mirror]) 
     return found
 
 
-def _sample_beams(recording: Recording, poses: Float, p_static: NDArray[np.float32]) -> Beams:
+def _sample_beams(recording: Recording, poses: Float, p_static: Float32) -> Beams:
     """The returns of every few scans."""
     T_map_sensor = recording.T_map_sensor(poses)
     every = max(1, recording.n_beams // _MAX_SAMPLE)

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
+from stillmap.core.array_types import Bool, Cells, Float
 
 _MIN_LENGTH, _MAX_LENGTH = 0.4, 1.4  # m, of the changed line
 _MAX_WIDTH = 5.0  # cells of it across
@@ -86,8 +85,8 @@ class SurfaceField(NamedTuple):
     """Which cells are surface, and which have some within a cell, in a box from `low` on."""
 
     low: Cells
-    is_surface: NDArray[np.bool_]
-    is_near: NDArray[np.bool_]
+    is_surface: Bool
+    is_near: Bool
 
     @classmethod
     def of_cells(cls, cells: Cells, middle: Float, reach: float) -> "SurfaceField":
@@ -102,7 +101,7 @@ class SurfaceField(NamedTuple):
                 is_near |= padded[i : i + size, j : j + size]
         return cls(low, is_surface, is_near)
 
-    def sample(self, layer: NDArray[np.bool_], points: NDArray[Any]) -> NDArray[np.bool_]:
+    def sample(self, layer: Bool, points: NDArray[Any]) -> Bool:
         """(...,) of a layer at points (..., 2) in cells; outside False."""
         at = np.round(points).astype(np.int64) - self.low
         inside = ((at >= 0) & (at < layer.shape[0])).all(axis=-1)

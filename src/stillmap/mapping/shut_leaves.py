@@ -7,15 +7,12 @@ tell how many of the doorways have a door, and for which share of the time doors
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Cells, Float
 from stillmap.mapping.doors import Door
 from stillmap.mapping.doorways import Doorway
 from stillmap.mapping.lone_leaves import LoneLeaf
 from stillmap.mapping.resting_leaf import SurfaceField
-
-Cells = NDArray[np.int64]
-Float = NDArray[np.float64]
 
 _RECESS = np.arange(2.0, 7.0)  # cells behind the face of the wall
 _MIN_COVERED, _MIN_EXACT = 0.9, 0.5  # share of the leaf within a cell of surface, and on it

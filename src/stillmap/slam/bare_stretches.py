@@ -8,13 +8,11 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.slam.local_map import travelled_distance
 from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.types import BareStretch, LoopClosure
-
-Float = NDArray[np.float64]
 
 _VELOCITY_TIME = 5.0  # s after which a velocity that no scan corrected says nothing any more
 _MIN_STEP_STD = 0.04  # m, from which a step is hardly measured

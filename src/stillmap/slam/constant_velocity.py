@@ -7,13 +7,11 @@ d = (pose, twist), T Exp(d_pose), in the base frame.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float
 from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
-
-Float = NDArray[np.float64]
 
 # s between two sweeps; less counts as the first, more as the second: whoever has not been seen for
 # so long may have done anything, and most likely stands near

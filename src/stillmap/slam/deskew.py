@@ -3,18 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.arrays import finite_rows, iter_blocks
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.options import SlamOptions
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MAX_SPEED, MAX_TURN_RATE = 100.0, 12.0  # m/s, rad/s; faster steps are leaps, not motion
 # share of a scan's duration between two poses, at least: over less, their errors dominate
@@ -60,13 +57,11 @@ def deskew_recording(
     return replace(recording, points=points, beam_time=None)
 
 
-def _deskew_3d(
-    recording: Recording, poses: Float, times: NDArray[np.float32], threads: int
-) -> Recording:
+def _deskew_3d(recording: Recording, poses: Float, times: Float32, threads: int) -> Recording:
     twists = _base_twists_3d(recording.stamp_ns, poses)
     points = recording.allocate_per_beam(np.float32, (3,))
 
-    def deskew_scan(t: int) -> NDArray[np.float32]:
+    def deskew_scan(t: int) -> Float32:
         beams = recording.beams_of(t)
         T = recording.T_base_sensor[recording.sensor[t]]
         in_base = recording.points[beams] @ T[:3, :3].T + T[:3, 3]
@@ -84,7 +79,7 @@ def _deskew_3d(
     return replace(recording, points=points, beam_time=None)
 
 
-def _base_twists_3d(stamp_ns: NDArray[np.int64], poses: Float) -> Float:
+def _base_twists_3d(stamp_ns: Int64, poses: Float) -> Float:
     """(T, 6) m/s and rad/s from each pose to the next in the base frame; 0 over leaps."""
     seconds = 1e-9 * np.diff(stamp_ns)
     if not len(seconds):
@@ -97,7 +92,7 @@ def _base_twists_3d(stamp_ns: NDArray[np.int64], poses: Float) -> Float:
     return np.concatenate([twists, twists[-1:]])
 
 
-def _max_beam_times(times: NDArray[np.float32]) -> tuple[float, float]:
+def _max_beam_times(times: Float32) -> tuple[float, float]:
     """Seconds after the stamp of the last beam of all, and before the stamp of the first."""
     parts = [(float(times[b].max()), -float(times[b].min())) for b in iter_blocks(times)]
     latest, earliest = zip(*parts, strict=True)
@@ -105,7 +100,7 @@ def _max_beam_times(times: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _select_scan_pairs(
-    stamp_ns: NDArray[np.int64], latest: float, earliest: float
+    stamp_ns: Int64, latest: float, earliest: float
 ) -> tuple[tuple[Index, Index], tuple[Index, Index]]:
     """Two scans from whose poses each scan's velocity follows: after its stamp, and before it.
 
@@ -151,7 +146,7 @@ def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Ind
     return np.stack([c * vx + s * vy, c * vy - s * vx, turn])
 
 
-def _has_leap(poses: Float, first: Index, second: Index) -> NDArray[np.bool_]:
+def _has_leap(poses: Float, first: Index, second: Index) -> Bool:
     """(T,) whether an implausible step lies between two scans."""
     plausible = motion_model.compute_odometry_steps(poses).plausible
     count = np.concatenate([[0], np.cumsum(~plausible)])
@@ -168,7 +163,7 @@ def _smooth(twists: Float) -> Float:
     return 0.25 * padded[:-2] + 0.5 * twists + 0.25 * padded[2:]
 
 
-def _transform_by_twist(points: NDArray[np.float32], log_T: Float) -> NDArray[np.float32]:
+def _transform_by_twist(points: Float32, log_T: Float) -> Float32:
     """Points (N, 2), each transformed by the exponential of log_T (3, N): x, y, angle."""
     dx, dy, angle = log_T
     half = 0.5 * angle

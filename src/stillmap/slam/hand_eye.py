@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float
 from stillmap.slam.motion_model import compute_odometry_steps
 from stillmap.slam.scan_motion import MotionWindows
 from stillmap.slam.turn_rates import sum_by_segment
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 Values = dict[str, float]
 
 SCALE, GAIN = "scale", "rotation_gain"
@@ -198,7 +196,7 @@ class HandEye:
             out.append(np.concatenate([shift, turn[:, None]], axis=1))
         return np.concatenate(out)
 
-    def fit(self, start: Values, free: Sequence[str], use: NDArray[np.bool_] | None = None) -> Fit:
+    def fit(self, start: Values, free: Sequence[str], use: Bool | None = None) -> Fit:
         """Gauss-Newton over the free parameters, with weights of Student's t distribution.
 
         Args:

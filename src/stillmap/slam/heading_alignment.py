@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.slam.pose_graph import Constraint, HeadingMeasurement, PoseGraph, optimize_headings
 from stillmap.slam.scan_hits import Scan, select_hits
-
-Float = NDArray[np.float64]
-
 
 _BINS = 360  # of a quarter turn
 _BIN = 0.5 * np.pi / _BINS  # rad, 0.25 degrees
@@ -127,7 +125,7 @@ _BREAK_VARIANCE = 1.0  # rad2, from which on a step is one across a break: it st
 
 
 def align_headings(
-    recording: Recording, e: NDArray[np.float32], graph: PoseGraph, covariance: Float
+    recording: Recording, e: Float32, graph: PoseGraph, covariance: Float
 ) -> PoseGraph:
     """The graph with keyframes whose headings agree with the directions of the walls.
 

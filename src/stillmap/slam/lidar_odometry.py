@@ -7,18 +7,15 @@ part of the estimate; what is minimized is in `docs/poses.md`.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.recording import Recording
 from stillmap.slam import constant_velocity
 from stillmap.slam.constant_velocity import State
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.types import ScanProgress
-
-Float = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 # map of plane cells: m, edge of the finest; levels, each of twice the edge; beams that a cell takes
 # in, as later ones have drifted
@@ -51,15 +48,15 @@ class Sweep:
         times: (N,) float32, s from the stamp.
     """
 
-    points: Points
-    weights: NDArray[np.float32]
-    times: NDArray[np.float32]
+    points: Float32
+    weights: Float32
+    times: Float32
 
-    def select(self, kept: NDArray[np.int64]) -> "Sweep":
+    def select(self, kept: Int64) -> "Sweep":
         """The points of these indices."""
         return Sweep(self.points[kept], self.weights[kept], self.times[kept])
 
-    def deskew(self, twist: Float) -> Points:
+    def deskew(self, twist: Float) -> Float32:
         """(N, 3) float32 in the base frame at the stamp, given the twist (6,) of the base."""
         return np.asarray(_core.transform_by_twist(self.points, self.times, twist))
 
@@ -82,7 +79,7 @@ class LidarOdometry:
     explained: Float
 
 
-def select_sweep(recording: Recording, e: NDArray[np.float32], t: int) -> Sweep:
+def select_sweep(recording: Recording, e: Float32, t: int) -> Sweep:
     """Sweep t of a 3D recording within the range of the map: the first hit in each voxel.
 
     e: (M,) P(static) of every beam.
@@ -99,12 +96,8 @@ def select_sweep(recording: Recording, e: NDArray[np.float32], t: int) -> Sweep:
 
 
 def make_sweep(
-    points: Points,
-    hit: NDArray[np.bool_],
-    e: NDArray[np.float32],
-    times: NDArray[np.float32] | None,
-    T_base_sensor: Float,
-) -> tuple[Sweep, NDArray[np.int64]]:
+    points: Float32, hit: Bool, e: Float32, times: Float32 | None, T_base_sensor: Float
+) -> tuple[Sweep, Int64]:
     """The first hit in each voxel within the range of the map, and the indices of these beams.
 
     Args:
@@ -147,7 +140,7 @@ def make_local_map(levels: int = _LEVELS) -> _core.NdtMap3D:
 
 def register_sweeps(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     options: OdometryOptions,
     progress: ScanProgress,
     threads: int,
@@ -200,7 +193,7 @@ class _SweepOdometry:
     """Arguments of `register_sweeps`."""
 
     recording: Recording
-    e: NDArray[np.float32]
+    e: Float32
     options: OdometryOptions
     threads: int
     max_points: int
@@ -268,9 +261,7 @@ def register_sweep(
     return State(T, twist, covariance), met / max(total, 1e-9)
 
 
-def match_planes(
-    local: _core.NdtMap3D, points: Float, T_map_base: Float
-) -> tuple[Float, NDArray[np.bool_]]:
+def match_planes(local: _core.NdtMap3D, points: Float, T_map_base: Float) -> tuple[Float, Bool]:
     """Normals (N, 3) in the base frame at points (N, 3), and which points lie on planes (N,).
 
     Only the finest cells count.

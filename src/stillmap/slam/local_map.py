@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam.scan_hits import add_scan
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 SCAN_SPACING = 0.2  # m or rad between scans that are added to a map; 5 s count as 1 m
 SPACING_PER_SECOND = 0.2
@@ -28,9 +26,7 @@ class LocalMap:
         e: (M,) P(static) of every beam.
     """
 
-    def __init__(
-        self, grid: _core.OccupancyGrid2D, recording: Recording, e: NDArray[np.float32]
-    ) -> None:
+    def __init__(self, grid: _core.OccupancyGrid2D, recording: Recording, e: Float32) -> None:
         self.grid = grid
         self._recording, self._e = recording, e
         self._kept: deque[tuple[int, Float, float]] = deque()  # scan, pose, m travelled

@@ -4,17 +4,15 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csgraph, csr_array
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.pose_graph import Constraint
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
-
-Float = NDArray[np.float64]
 
 MIN_LOOP_TRAVEL = 15.0  # m after which a place counts as revisited
 # loops are searched in stages of travel, after each of which the graph is solved: m, share of the
@@ -78,14 +76,14 @@ def _shortest_paths(
         return np.append(steps[::-1].cumsum()[::-1], 0.0)
     scans = np.array([[closure.earlier, closure.later] for closure in closures])[is_before]
     first, second = np.searchsorted(context.keyframes, scans).T
-    ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
+    ends = np.stack([np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)])
     # even where the robot stands a path through fewer keyframes is the shorter one
     weights = np.concatenate([steps, lengths[is_before]]).clip(1e-9)
     order = np.argsort(weights)  # of edges between the same keyframes the shortest counts
-    ends = np.sort(ends, axis=0)[:, order]
-    ends, shortest = np.unique(ends, axis=1, return_index=True)
-    graph = csr_array((weights[order][shortest], ends), shape=(k + 1, k + 1))
-    return csgraph.dijkstra(graph, directed=False, indices=k)
+    ends, shortest = np.unique(np.sort(ends, axis=0)[:, order], axis=1, return_index=True)
+    row, column = ends
+    graph = csr_array((weights[order][shortest], (row, column)), shape=(k + 1, k + 1))
+    return np.asarray(csgraph.dijkstra(graph, directed=False, indices=[k])[0])
 
 
 def blind_stds(context: LoopContext, k: int, closures: list[LoopClosure]) -> tuple[Float, Float]:

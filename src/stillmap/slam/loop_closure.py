@@ -5,9 +5,9 @@ import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import (
     bare_stretches,
@@ -21,9 +21,7 @@ from stillmap.slam.heading_alignment import align_headings
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.slam.relocalization import Relocalization
-from stillmap.slam.types import Index, LoopClosure, LoopContext, MStepResult, ScanProgress
-
-Float = NDArray[np.float64]
+from stillmap.slam.types import LoopClosure, LoopContext, MStepResult, ScanProgress
 
 KEYFRAME_DISTANCE, SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
 _MAX_CHI2 = 16.0  # 3 degrees of freedom; above it the graph rejects a loop
@@ -31,7 +29,7 @@ _MAX_CHI2 = 16.0  # 3 degrees of freedom; above it the graph rejects a loop
 
 def close_loops(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     options: SlamOptions,
     odometry: MStepResult,
     progress: ScanProgress,
@@ -74,7 +72,7 @@ def close_loops(
 
 
 def _relocalize(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, odometry: MStepResult
+    recording: Recording, e: Float32, options: SlamOptions, odometry: MStepResult
 ) -> Relocalization:
     """The trajectory with all segments relocalized."""
     poses, breaks = odometry.poses, odometry.diagnostics.breaks
@@ -147,11 +145,7 @@ def close_stage(
 
 
 def _correct_stage(
-    context: LoopContext,
-    chain: list[Constraint],
-    poses: Float,
-    last: int,
-    found: list[LoopClosure],
+    context: LoopContext, chain: list[Constraint], poses: Float, last: int, found: list[LoopClosure]
 ) -> tuple[Float, list[LoopClosure]]:
     """Keyframes (K, 3, 3) with those before `last` optimized, and the closures that fit them.
 
@@ -275,7 +269,7 @@ class _AcceptedLoops:
             map's axes.
     """
 
-    scans: NDArray[np.intp]
+    scans: Index
     T: Float
     P_earlier: Float
     P_later: Float
@@ -297,7 +291,7 @@ class _AcceptedLoops:
         P = context.poses[scans]
         return cls(scans, T, P[:, 0], P[:, 1], covariance, accumulated)
 
-    def agree(self, n: int, others: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def agree(self, n: int, others: Index) -> Bool:
         """(K,) whether loop n and others (K,) fit the motion between their later scans."""
         is_first = self.scans[n, 1] <= self.scans[others, 1]
         a, b = np.where(is_first, n, others), np.where(is_first, others, n)

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import lidar_odometry, local_map
 from stillmap.slam.constant_velocity import State
@@ -19,9 +19,7 @@ from stillmap.slam.loop_verification import CLOSURE_TRANSLATION
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.slam.scan_matching import WALL_OCCUPANCY
-from stillmap.slam.types import Index, LoopClosure, ScanProgress
-
-Float = NDArray[np.float64]
+from stillmap.slam.types import LoopClosure, ScanProgress
 
 KEYFRAME_DISTANCE, SEARCH_DISTANCE = 2.0, 8.0  # m, defaults of the options
 # m after which a place counts as revisited; m of travel to either side that forms a submap: at most
@@ -42,7 +40,7 @@ _GRID_CELL, _WALL_MARGIN = 0.4, 1.0  # m: cells in which beams are traced; befor
 
 def close_loops_3d(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     options: SlamOptions,
     odometry: LidarOdometry,
     progress: ScanProgress,
@@ -115,7 +113,7 @@ class SweepLoopCloser:
     """
 
     recording: Recording
-    e: NDArray[np.float32]
+    e: Float32
     odometry: LidarOdometry
     travelled: Float
     keyframes: Index

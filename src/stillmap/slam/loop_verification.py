@@ -4,17 +4,15 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
 from stillmap.slam.loop_candidates import drift_std
-from stillmap.slam.scan_hits import Points, Scan, transform_points
+from stillmap.slam.scan_hits import Scan, transform_points
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
-
-Float = NDArray[np.float64]
 
 SUBMAP_TRAVEL = 8.0  # m of travel to either side that forms a submap
 _SUBMAP_SPACING = 0.25  # of that between keyframes; denser takes longer without being better
@@ -133,7 +131,7 @@ def verify_candidate(
     )
 
 
-def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Points]:
+def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Float32]:
     """Hits of a keyframe and of scans to either side, in its frame; and points before their ends.
 
     A view of a single wall could slide along it: it grows until surfaces of other directions are in
@@ -189,17 +187,17 @@ def _isotropy(view: Scan) -> float:
     return float(least / max(most, 1e-9))
 
 
-def _points_before_ends(scan: Scan, metres: float) -> Points:
+def _points_before_ends(scan: Scan, metres: float) -> Float32:
     """(N, 2) points so far before the ends of the beams, or half way if that is farther out."""
     origin = scan.T_base_sensor[:2, 2].astype(np.float32)
     beams = scan.points - origin
     length = np.linalg.norm(beams, axis=1, keepdims=True).clip(1e-6)
-    before: Points = origin + beams * np.maximum(0.5, 1.0 - metres / length)
+    before: Float32 = origin + beams * np.maximum(0.5, 1.0 - metres / length)
     return before
 
 
 def _select_comparable(
-    submap: _core.OccupancyGrid2D, view: Scan, before: Points, T_map_base: Float
+    submap: _core.OccupancyGrid2D, view: Scan, before: Float32, T_map_base: Float
 ) -> tuple[Scan, float]:
     """The part of a view that the submap observed from the same side, and its share.
 

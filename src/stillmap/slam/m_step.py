@@ -7,11 +7,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, scan_hits, scan_matching
 from stillmap.slam.deskew import deskew_recording
@@ -23,9 +23,6 @@ from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, add_scan, thin_scans
 from stillmap.slam.types import MStepResult, ScanProgress
-
-Float = NDArray[np.float64]
-
 
 _SCANS_PER_CALL = 200  # of the kernel; interrupts are noticed in between
 
@@ -41,12 +38,12 @@ class _MotionSteps(NamedTuple):
 
     increments: Float
     std: Float
-    known: NDArray[np.bool_]
+    known: Bool
 
 
 def refine_poses(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     options: SlamOptions,
     initial: MStepResult,
     progress: ScanProgress,
@@ -123,7 +120,7 @@ _REFINEMENT_PASSES = 1
 
 def m_step(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     options: SlamOptions,
     poses: Float | None,
     threads: int,
@@ -172,7 +169,7 @@ class _PoseStep:
     """The M-step over poses; arguments as of `m_step`. Grids of results are empty."""
 
     recording: Recording
-    e: NDArray[np.float32]
+    e: Float32
     options: SlamOptions
     threads: int
     progress: StepProgress

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float
 from stillmap.slam.options import OdometryOptions
-
-Float = NDArray[np.float64]
 
 MIN_INCREMENT_STD = 0.02, 0.02  # m, rad: of an increment without motion
 _TRANSLATION_FLOOR, _ROTATION_FLOOR = MIN_INCREMENT_STD
@@ -72,7 +70,7 @@ class OdometrySteps:
     """
 
     increments: Float
-    plausible: NDArray[np.bool_]
+    plausible: Bool
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def blind_drift(prior: MotionPrior, covariance: Float) -> Float:
 
 def fit_odometry_noise(
     increments: Float, motion: Float, options: OdometryOptions
-) -> tuple[OdometryNoise, NDArray[np.bool_]]:
+) -> tuple[OdometryNoise, Bool]:
     """Noise of odometry increments (T, 3, 3) about a motion (T, 3, 3), and which are at fault.
 
     From medians of the residuals, on which faults have no influence.

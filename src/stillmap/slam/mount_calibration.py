@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.slam.hand_eye import (
@@ -28,8 +29,6 @@ from stillmap.slam.hand_eye import (
 from stillmap.slam.scan_hits import thin_scans
 from stillmap.slam.scan_motion import MotionWindows, measure_motion, select_segments
 from stillmap.slam.turn_rates import fit_latency
-
-Float = NDArray[np.float64]
 
 YAW, POSITION, UPSIDE_DOWN, LATENCY = "theta", ("x", "y"), "upside_down", "latency"
 

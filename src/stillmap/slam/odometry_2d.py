@@ -3,10 +3,10 @@
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.slam import bare_stretches, motion_model, relocalization
 from stillmap.slam.local_map import LocalMap
@@ -28,8 +28,6 @@ from stillmap.slam.scan_matching import (
 )
 from stillmap.slam.types import Diagnostics, MStepResult, ScanProgress
 
-Float = NDArray[np.float64]
-
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _MAX_SPEED, _MAX_TURN_RATE, _MIN_REACH = 3.0, 4.0, 0.5  # m/s, rad/s of robots; m and rad
 _SURE_GAIN = 40.0  # nats of a pose outside the prior, from which one scan is enough
@@ -38,7 +36,7 @@ _MAX_LATE_SCANS = 4  # after which odometry is not late, but at fault
 
 def register_scans(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     options: SlamOptions,
     progress: ScanProgress,
     max_travel: float = np.inf,
@@ -72,7 +70,7 @@ class _ScanOdometry:
     def __init__(
         self,
         recording: Recording,
-        e: NDArray[np.float32],
+        e: Float32,
         options: SlamOptions,
         max_travel: float,
         local_map: LocalMap,

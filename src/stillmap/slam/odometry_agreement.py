@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.types import Diagnostics
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SECONDS = (1.0, 2.0, 4.0)  # of the windows in which differences are summed
 # a sum counts from so many standard deviations and m on; error of odometry per m that stays the
@@ -29,7 +27,7 @@ _MAX_SHARE = 0.5  # of the steps in such stretches: odometry that differs more o
 def replace_stretches(
     poses: Float,
     T_odom_base: Float,
-    stamp_ns: NDArray[np.int64],
+    stamp_ns: Int64,
     diagnostics: Diagnostics,
     options: OdometryOptions,
 ) -> Float | None:
@@ -60,8 +58,8 @@ def replace_stretches(
 
 
 def find_differences(
-    motion: Float, increments: Float, stamp_ns: NDArray[np.int64], options: OdometryOptions
-) -> Mask:
+    motion: Float, increments: Float, stamp_ns: Int64, options: OdometryOptions
+) -> Bool:
     """(T - 1,) steps in windows over which a motion and odometry differ by more than noise.
 
     The noise of odometry is learned from the differences of all steps.
@@ -103,7 +101,7 @@ def _accumulate(steps: NDArray[Any]) -> Float:
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
-def _exclude_known_faults(differs: Mask, plausible: Mask, diagnostics: Diagnostics) -> Mask:
+def _exclude_known_faults(differs: Bool, plausible: Bool, diagnostics: Diagnostics) -> Bool:
     """The steps (T - 1,) of the stretches without faults, breaks or leaps that were noticed."""
     at_fault, breaks = np.zeros((2, len(differs) + 1), np.bool_)
     at_fault[diagnostics.odometry_faults] = True

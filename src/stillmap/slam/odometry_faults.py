@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import ODOMETRY_FAULT, ScanMatch
-
-Float = NDArray[np.float64]
 
 _MIN_STEP = 0.02  # m and rad between scans: a slower robot may as well have stopped
 _STILL_RATIO = 0.2  # of the predicted step: shorter odometry steps count as standing still

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float, Index
 from stillmap.core.short_repr import ShortRepr
-
-Float = NDArray[np.float64]
 
 _TOLERANCE, _COARSE_TOLERANCE = 1e-7, 1e-3  # relative change of the cost; coarse between steps
 _ANNEALING_STEPS = 8  # solutions of graduated non-convexity
@@ -62,16 +60,13 @@ class PoseGraph(ShortRepr):
         constraints: between keyframes: successive ones first, then accepted loop closures.
     """
 
-    keyframes: NDArray[np.intp]
+    keyframes: Index
     poses: Float
     constraints: list[Constraint]
 
 
 def optimize_poses(
-    poses: Float,
-    chain: list[Constraint],
-    loops: list[Constraint],
-    max_chi2: float | None = None,
+    poses: Float, chain: list[Constraint], loops: list[Constraint], max_chi2: float | None = None
 ) -> Float:
     """(K, D+1, D+1) poses of least squares; the first pose is fixed.
 

@@ -12,18 +12,16 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import local_map, loop_verification, motion_model, scan_matching
 from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
 from stillmap.slam.scan_hits import Scan, select_hits
 from stillmap.slam.scan_matching import MAX_OCCLUDED, ScanMatch
-from stillmap.slam.types import Index, LoopCandidate, LoopClosure, LoopContext
-
-Float = NDArray[np.float64]
+from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 _MAX_QUERIES = 20  # keyframes of a segment that are matched
 _MAX_PLACES = 8  # places that each of them is matched with
@@ -354,7 +352,7 @@ def judge_scan(grid: _core.OccupancyGrid2D, scan: Scan, match: ScanMatch, usual:
 
 def look_ahead(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     grid: _core.OccupancyGrid2D,
     increments: Float,
     t: int,

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.prepare.options import MAX_POINT_DISTANCE
 from stillmap.slam.lidar_odometry import register_sweeps
@@ -22,9 +22,6 @@ from stillmap.slam.scan_hits import (
     select_hits,
 )
 from stillmap.slam.scan_matching import refine_pose, search_pose
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _RESOLUTION = 0.1  # m, of the map that scans are matched against, whatever that of the result
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
@@ -143,7 +140,7 @@ def _rematch(window: Recording, poses: Float, threads: int) -> Float:
     return normalize(poses[0] @ se2.inverse(found[0]) @ found)
 
 
-def _match_scans(window: Recording, e: NDArray[np.float32], options: SlamOptions) -> Float:
+def _match_scans(window: Recording, e: Float32, options: SlamOptions) -> Float:
     """Poses (n, 3, 3) of 2D scans, each matched within the prior of odometry.
 
     Without the wide searches of `register_scans`: given poses that jump disagree with these anyway.

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
-
-Float = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 FREE_SPACE_MARGIN = 0.5  # m before its end in which a beam is not used as free space
 # gaps between neighboring end points on a surface that are filled: at most m wide, m that three of
@@ -35,20 +33,20 @@ class Scan:
         isotropy: (N,) float32, 0 on a flat surface, 1 where an end point fixes both directions.
     """
 
-    points: Points
-    weights: NDArray[np.float32]
+    points: Float32
+    weights: Float32
     T_base_sensor: Float
-    normals: Points
-    isotropy: NDArray[np.float32]
+    normals: Float32
+    isotropy: Float32
 
 
-def transform_points(points: Points, T: Float) -> Points:
-    """Points (N, D) float32 transformed by (D+1, D+1)."""
+def transform_points(points: Float32, T: Float) -> Float32:
+    """Float32 (N, D) float32 transformed by (D+1, D+1)."""
     return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
 
 
 def select_hits(
-    recording: Recording, e: NDArray[np.float32], t: int, normals: Mapping[str, float] = NORMALS
+    recording: Recording, e: Float32, t: int, normals: Mapping[str, float] = NORMALS
 ) -> Scan:
     """The hits of scan t; `normals`: how they are estimated, see NORMALS."""
     beams = recording.beams_of(t)
@@ -59,10 +57,7 @@ def select_hits(
 
 
 def make_scan(
-    points: Points,
-    weights: NDArray[np.float32],
-    T_base_sensor: Float,
-    normals: Mapping[str, float] = NORMALS,
+    points: Float32, weights: Float32, T_base_sensor: Float, normals: Mapping[str, float] = NORMALS
 ) -> Scan:
     """A scan of end points (N, 2) in the order of the beams, with the normals of its surfaces."""
     n, isotropy = np.zeros_like(points), np.zeros_like(weights)
@@ -74,7 +69,7 @@ def make_scan(
 def add_scan(
     grid: _core.OccupancyGrid2D,
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     t: int,
     T_map_base: Float,
     *,
@@ -92,9 +87,9 @@ def add_scan(
 
 def add_hits(
     grid: _core.OccupancyGrid2D,
-    points: Points,
-    hit: NDArray[np.bool_],
-    weights: NDArray[np.float32],
+    points: Float32,
+    hit: Bool,
+    weights: Float32,
     T_map_sensor: Float,
     *,
     remove: bool = False,
@@ -109,10 +104,10 @@ def add_hits(
 
 def replace_weights(
     grid: _core.OccupancyGrid2D,
-    points: Points,
-    hit: NDArray[np.bool_],
-    before: NDArray[np.float32],
-    after: NDArray[np.float32],
+    points: Float32,
+    hit: Bool,
+    before: Float32,
+    after: Float32,
     T_map_sensor: Float,
 ) -> None:
     """Give the hits that `add_hits` added other weights, as if it had added those; no beam is
@@ -130,7 +125,6 @@ def replace_weights(
 
 
 Values = NDArray[Any]
-Index = NDArray[np.intp]
 
 # of a planar scan that are registered, more than lasers have: all around, they end as far apart as
 # cells of 0.05 m at 16 m

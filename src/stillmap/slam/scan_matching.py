@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Float
 from stillmap.slam import motion_model, scan_hits
 from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.scan_hits import NORMALS, Scan
-
-Float = NDArray[np.float64]
 
 # likelihood field: m, std around end points; value of an unexplained end point; value added in
 # unknown space, which is not free; weight of one beam against the motion prior

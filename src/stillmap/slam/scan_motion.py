@@ -9,19 +9,16 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import scan_hits, scan_matching
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import compute_odometry_steps, gaussian_prior
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, Scan
 from stillmap.slam.scan_matching import ScanMatch
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 WINDOW = 0.8  # m or rad of motion that make a window
 _SEGMENT_UNITS, _SEGMENT_SCANS = 4.0, 36  # motion and scans of a segment, at most
@@ -90,7 +87,7 @@ def select_segments(recording: Recording, sensor: int, windows: int) -> list[Ind
     return [scans[a:b] for a, b in chosen]
 
 
-def _split(motion: Float, joined: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _split(motion: Float, joined: Bool) -> list[tuple[int, int]]:
     """Half-open ranges of scans, cut after so much motion (T - 1,) or so many scans, without those
     in which too little happens."""
     parts, start, units = [], 0, 0.0
@@ -129,10 +126,7 @@ def _spread(
 
 
 def measure_motion(
-    recording: Recording,
-    e: NDArray[np.float32],
-    segments: list[Index],
-    resolution: float,
+    recording: Recording, e: Float32, segments: list[Index], resolution: float
 ) -> MotionWindows:
     """Motion windows of a laser along segments of its scans.
 
@@ -160,9 +154,7 @@ _FIELDS = tuple(MotionWindows.__dataclass_fields__)
 class _Tracker:
     """Follows one segment; poses are those of the laser, the first one is the identity."""
 
-    def __init__(
-        self, recording: Recording, e: NDArray[np.float32], scans: Index, resolution: float
-    ) -> None:
+    def __init__(self, recording: Recording, e: Float32, scans: Index, resolution: float) -> None:
         assert recording.T_odom_base is not None
         self.recording, self.e, self.scans = recording, e, scans
         self.grid = _core.OccupancyGrid2D(resolution, FREE_SPACE_MARGIN)

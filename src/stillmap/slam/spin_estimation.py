@@ -11,17 +11,15 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
 from stillmap.prepare.beam_times import add_beam_times
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.lidar_odometry import LidarOdometry, register_sweeps
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import beams_of_scans, sees_all_round, select_beams
-
-Float = NDArray[np.float64]
 
 Spin = Literal["clockwise", "counter-clockwise"]
 

@@ -8,14 +8,11 @@ of the two stretches contradict each other by. `docs/estimator.md` has the defin
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.slam.local_map import travelled_distance
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 CELL = 0.5  # m, edge of a cube: smaller than rooms, larger than the noise of any sensor
 STRETCH = 4.0  # m of travel that count as one visit
@@ -32,9 +29,9 @@ _MAX_RETURNS = 500_000  # of all scans; of longer recordings, every so many scan
 class _Patches(NamedTuple):
     """Planar patches, sorted by cube and then by stretch of travel."""
 
-    cube: Index
-    stretch: Index
-    returns: Index
+    cube: Int64
+    stretch: Int64
+    returns: Int64
     mean: Float
     normal: Float
 
@@ -64,7 +61,7 @@ def mean_displacement(recording: Recording, poses: Float) -> float | None:
     return float(np.average(np.minimum(across, _MAX_DISPLACEMENT), weights=weight))
 
 
-def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Index]:
+def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Int64]:
     """End points (N, D) in the map, and their stretches of travel (N,)."""
     stretch = (travelled_distance(poses) / STRETCH).astype(np.int64)
     every = max(1, -(-recording.n_beams // _MAX_RETURNS))
@@ -79,7 +76,7 @@ def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Index]:
     return np.concatenate(points), np.concatenate(stretches)
 
 
-def _fit_patches(points: Float, stretch: Index) -> _Patches:
+def _fit_patches(points: Float, stretch: Int64) -> _Patches:
     """The planar patches among the returns of each cube and stretch."""
     D = points.shape[1]
     cubes = np.floor(points / CELL).astype(np.int64)

@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.slam.scan_motion import MotionWindows
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MAX_LATENCY = 0.6  # s, early or late, that is tried
 _LATENCY_STEP = 0.05  # s
@@ -38,7 +35,7 @@ class LatencyFit:
 
 
 def fit_latency(
-    windows: MotionWindows, seconds: Float, T_odom_base: Float, use: NDArray[np.bool_] | None = None
+    windows: MotionWindows, seconds: Float, T_odom_base: Float, use: Bool | None = None
 ) -> LatencyFit:
     """Fits odometry's turns between scans as a factor times those of the laser some time before.
 
@@ -92,11 +89,7 @@ class _Turns:
     """
 
     def __init__(
-        self,
-        windows: MotionWindows,
-        seconds: Float,
-        heading: Float,
-        use: NDArray[np.bool_] | None,
+        self, windows: MotionWindows, seconds: Float, heading: Float, use: Bool | None
     ) -> None:
         parts = list(_split_segments(windows, seconds, use))
         self._width = _SMOOTHING * float(
@@ -129,7 +122,7 @@ class _Turns:
 
 
 def _split_segments(
-    windows: MotionWindows, seconds: Float, use: NDArray[np.bool_] | None
+    windows: MotionWindows, seconds: Float, use: Bool | None
 ) -> list[tuple[int, Float, Float]]:
     """Number, times and headings of each segment."""
     parts = []

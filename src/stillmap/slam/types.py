@@ -5,18 +5,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 import stillmap._core as _core
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.slam import scan_hits
 from stillmap.slam.pose_graph import PoseGraph
 from stillmap.slam.scan_hits import Scan
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 ScanProgress = Callable[[int, int], None]  # scans done, total
 
 
@@ -150,7 +146,7 @@ class LoopContext:
     """
 
     recording: Recording
-    e: NDArray[np.float32]
+    e: Float32
     poses: Float
     travelled: Float
     explained: Float

@@ -8,14 +8,11 @@ objects that were tracked as one separate, the past points are split between the
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, kalman
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.kalman import TrackStates
 from stillmap.tracking.clustering import LINK_PER_METRE, DynamicPoints
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 NO_TRACK = -1
 MAX_GAP = 2.0  # s without points after which a track ends: a person is hidden for about as long
@@ -165,7 +162,7 @@ class _Tracker:
             claims = _complete_clusters(claims, cluster, len(sigma))
         return claims
 
-    def _nearest(self, xy: Float, gate: float, among: NDArray[np.bool_]) -> Index:
+    def _nearest(self, xy: Float, gate: float, among: Bool) -> Index:
         """(n,) the most likely of some tracks (K,) within `gate` metres and the uncertainty."""
         out = np.full(len(xy), NO_TRACK)
         left, right = self._extents()
@@ -282,7 +279,7 @@ class _Tracker:
             every = -(-count // _MAX_SHAPE_POINTS)
             self._keep_shapes((np.arange(len(self._of)) - first[self._of]) % every[self._of] == 0)
 
-    def _keep(self, kept: NDArray[np.bool_]) -> None:
+    def _keep(self, kept: Bool) -> None:
         """Terminate all other tracks."""
         if kept.all():
             return
@@ -291,7 +288,7 @@ class _Tracker:
         self._states, self._id = self._states.select(kept), self._id[kept]
         self._last = self._last[kept]
 
-    def _keep_shapes(self, kept: NDArray[np.bool_]) -> None:
+    def _keep_shapes(self, kept: Bool) -> None:
         self._offset, self._of = self._offset[kept], self._of[kept]
         self._when = self._when[kept]
 
@@ -345,7 +342,7 @@ def _distance(one: Float, other: Float) -> float:
     return float(np.sqrt(np.min(squared)))
 
 
-def _argmin_allowed(cost: Float, allowed: NDArray[np.bool_]) -> Index:
+def _argmin_allowed(cost: Float, allowed: Bool) -> Index:
     """(n,) columns of least cost among those allowed; NO_TRACK where none is."""
     cost = np.where(allowed, cost, np.inf)
     best = cost.argmin(axis=1)

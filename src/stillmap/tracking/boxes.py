@@ -4,15 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.tracking import MovingObject
 from stillmap.tracking.clustering import extract_dynamic_points
 from stillmap.tracking.objects import HEADING_SPEED
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 HOLD = 0.5  # s for which an object persists before its first and after its last detection
 MAX_OBJECT_HEIGHT = 2.0  # m above the ground
@@ -69,7 +66,7 @@ class Box:
 def fit_boxes(
     recording: Recording,
     poses: Float,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
     objects: Sequence[MovingObject],
     min_p_dynamic: float,
     hold: float,

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # P(dynamic) from which a beam may belong to a moving object: 1 - p_static of what is known to move
 # lies near 1, of what is not known at the prior
@@ -64,7 +62,7 @@ class DynamicPoints:
 
 
 def extract_dynamic_points(
-    recording: Recording, poses: Float, p_static: NDArray[np.float32], min_p_dynamic: float
+    recording: Recording, poses: Float, p_static: Float32, min_p_dynamic: float
 ) -> DynamicPoints:
     """Select the hits whose P(dynamic) is at least `min_p_dynamic`, and cluster them.
 
@@ -122,7 +120,7 @@ def _cluster(scan: Index, xy: Float, distance: Float) -> Index:
     return np.append(0, np.cumsum((np.diff(scan) > 0) | (step > max_step)))
 
 
-def _largest_clusters(scan: Index, cluster: Index) -> NDArray[np.bool_]:
+def _largest_clusters(scan: Index, cluster: Index) -> Bool:
     """(N,) whether a point is of one of the clusters of its scan that are followed."""
     _, first, size = np.unique(cluster, return_index=True, return_counts=True)
     of = scan[first]

@@ -4,14 +4,10 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Float, Index
 from stillmap.tracking.clustering import DynamicPoints
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-
 
 _MANY = 1 << 16  # points that tell how far apart beams are
 

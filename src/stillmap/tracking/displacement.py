@@ -11,13 +11,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
 from stillmap.tracking.objects import MovingObject
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _MIN_TRAVEL = 0.5  # m: errors of the poses and visible parts move what stands by less
 _RADIUS = 0.4  # m around the center of what stands, that count as its place
@@ -104,7 +101,7 @@ def _is_empty(looks: Sequence[_Look], during: Sequence[_Look]) -> bool:
     return 2 * len(passed) > len(looks) and p_pass**expected < _MAX_P_MISSED
 
 
-def _choose_looks(one: MovingObject, stamp_ns: NDArray[np.int64]) -> tuple[Index, Index, Index]:
+def _choose_looks(one: MovingObject, stamp_ns: Int64) -> tuple[Index, Index, Index]:
     """Scans before the first detection, after the last, and some with a detection."""
     reach = round(1e9 * _LOOK_TIME)
     first, last = np.searchsorted(stamp_ns, [one.stamp_ns[0] - reach, one.stamp_ns[-1] + reach])
@@ -156,8 +153,6 @@ def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:
     )
 
 
-Bool = NDArray[np.bool_]
-
 _LOOKS_ATTACHMENT = 4  # scans of a track that are evaluated
 _NEIGHBORS = 8  # of a beam: the ring around it in an image
 _MAX_STEP = 0.15  # m between the ranges of neighbors on one surface
@@ -166,7 +161,7 @@ _MAX_ATTACHMENT = 0.4  # one side of an object and its ground are less
 
 
 def drop_surface_parts(
-    objects: Sequence[MovingObject], recording: Recording, p_static: NDArray[np.float32]
+    objects: Sequence[MovingObject], recording: Recording, p_static: Float32
 ) -> list[MovingObject]:
     """The objects that are no part of a static surface.
 
@@ -181,8 +176,8 @@ def drop_surface_parts(
 
 
 def count_neighbors(
-    objects: Sequence[MovingObject], recording: Recording, p_static: NDArray[np.float32]
-) -> NDArray[np.int64]:
+    objects: Sequence[MovingObject], recording: Recording, p_static: Float32
+) -> Int64:
     """(K, 2) beams beside each object that end on its surface, and behind it.
 
     Static beams at the range of the object's nearest one end on its surface. Others at that range

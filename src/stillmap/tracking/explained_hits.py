@@ -9,14 +9,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
 from stillmap.tracking.mover_path import MoverPath
-
-Float = NDArray[np.float64]
-
 
 _ROUNDS = 100  # of EM at most
 _TOLERANCE = 1e-6  # of the share, at which EM ends
@@ -46,9 +43,6 @@ def compute_probability(log_odds: Float) -> Float:
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))))
 
 
-Index = NDArray[np.intp]
-Labels = NDArray[np.float32]
-
 _MARGIN, _MARGIN_OF_WALKERS = 0.15, 0.1  # m around the box, the circle: chairs are near walkers
 _CELL = 0.25  # m, of a place
 _STRAY = 19.0  # Beta(1, 19): share of the hits outside, of places that only movers were in
@@ -69,12 +63,8 @@ class MoverHits(NamedTuple):
 
 
 def explain_hits(
-    recording: Recording,
-    poses: Float,
-    p_static: Labels,
-    on_movers: MoverHits,
-    is_vehicle: NDArray[np.bool_],
-) -> Labels:
+    recording: Recording, poses: Float, p_static: Float32, on_movers: MoverHits, is_vehicle: Bool
+) -> Float32:
     """(M,) P(static), lower for beams that ended on movers.
 
     Of the m + n hits of a place, m are explained by movers and n not. Where something static
@@ -142,11 +132,7 @@ def _place_boxes(seconds: Float, paths: Sequence[MoverPath]) -> _Boxes:
 
 
 def find_mover_hits(
-    recording: Recording,
-    poses: Float,
-    seconds: Float,
-    paths: Sequence[MoverPath],
-    p_mover: Float,
+    recording: Recording, poses: Float, seconds: Float, paths: Sequence[MoverPath], p_mover: Float
 ) -> MoverHits:
     """The hits within the boxes of what is followed.
 
@@ -184,9 +170,7 @@ def find_mover_hits(
     return MoverHits(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _static_hits(
-    recording: Recording, poses: Float, p_static: Labels, places: NDArray[np.int64]
-) -> Float:
+def _static_hits(recording: Recording, poses: Float, p_static: Float32, places: Int64) -> Float:
     """(P,) expected number of static hits in each place."""
     out = np.zeros(len(places))
     for block in arrays.iter_blocks(recording.hit, p_static):
@@ -198,7 +182,7 @@ def _static_hits(
     return out
 
 
-def _keys(xy: Float) -> NDArray[np.int64]:
+def _keys(xy: Float) -> Int64:
     """(n,) one key per square of the plane."""
     square = np.floor(xy / _CELL).astype(np.int64)
     return np.asarray((square[:, 0] << 32) + square[:, 1], np.int64)

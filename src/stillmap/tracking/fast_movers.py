@@ -11,15 +11,12 @@ comes into view.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.mover_path import MoverPath, fit_path
 from stillmap.tracking.vehicle_filter import MAX_SPEED, MIN_SPEED, follow
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _MAX_FRAGMENT = 0.6  # s: tracks of walkers that last for longer are none
 _MAX_STEP = 0.45  # s between two looks of a seed
@@ -97,7 +94,7 @@ def tracks_of_paths(points: DynamicPoints, owner: Index, paths: list[MoverPath])
     return out
 
 
-def _find_lasting(points: DynamicPoints, owner: Index) -> NDArray[np.bool_]:
+def _find_lasting(points: DynamicPoints, owner: Index) -> Bool:
     """(K,) tracks that are seen for longer than in passing, and in most scans."""
     n = max(int(owner[block].max()) for block in arrays.iter_blocks(owner)) + 1
     scans, last = np.zeros((2, n), np.intp)
@@ -111,7 +108,7 @@ def _find_lasting(points: DynamicPoints, owner: Index) -> NDArray[np.bool_]:
     return np.asarray(lasts & (scans >= _MIN_DENSITY * (last - first + 1)))
 
 
-def _select_looks(points: DynamicPoints, owner: Index, lasting: NDArray[np.bool_]) -> _Looks:
+def _select_looks(points: DynamicPoints, owner: Index, lasting: Bool) -> _Looks:
     """The clusters whose first point is of no lasting track, and wide ones."""
     begins = _cluster_begins(points)
     ends = np.append(begins[1:], len(points.cluster))
@@ -167,7 +164,7 @@ def _blocks_of_pairs(looks: _Looks, of: Index) -> list[Index]:
     return np.split(np.arange(len(of)), ends)
 
 
-def _select(seeds: _Seeds, rows: Index | NDArray[np.bool_]) -> _Seeds:
+def _select(seeds: _Seeds, rows: Index | Bool) -> _Seeds:
     return _Seeds._make(column[rows] for column in seeds)
 
 
@@ -267,7 +264,7 @@ def _follow_seeds(points: DynamicPoints, looks: _Looks, seeds: _Seeds) -> list[M
 
 
 def _claim(
-    points: DynamicPoints, owner: Index, path: MoverPath, lasting: NDArray[np.bool_], first: int
+    points: DynamicPoints, owner: Index, path: MoverPath, lasting: Bool, first: int
 ) -> Index:
     """The points of a fast mover without those of people whom it passes.
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32, Int32, Int64
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import bound_box
-
-Float = NDArray[np.float64]
 
 _STEP = 0.25  # of a square: spacing of the samples along a track
 _MIN_ABSENCE = 5.0  # s after which a return to a square is another crossing
@@ -22,7 +20,7 @@ class MovingTrack(Protocol):
     """Anything with stamps (L,), positions and velocities (L, 2) in the plane."""
 
     @property
-    def stamp_ns(self) -> NDArray[np.int64]: ...
+    def stamp_ns(self) -> Int64: ...
     @property
     def xy(self) -> Float: ...
     @property
@@ -40,8 +38,8 @@ class FlowMap(ShortRepr):
         resolution: metres.
     """
 
-    crossings: NDArray[np.int32]
-    speed: NDArray[np.float32]
+    crossings: Int32
+    speed: Float32
     origin: tuple[float, float, float]
     resolution: float
 
@@ -80,7 +78,7 @@ def compute_flow_map(objects: Sequence[MovingTrack], resolution: float = 0.5) ->
     )
 
 
-def _crossings(one: MovingTrack, resolution: float) -> tuple[NDArray[np.int64], Float]:
+def _crossings(one: MovingTrack, resolution: float) -> tuple[Int64, Float]:
     """Squares (V, 2) that an object crosses, column and row, and its mean speed (V,) there."""
     seconds = 1e-9 * (one.stamp_ns - one.stamp_ns[0])
     xy, t = _resample(one.xy, seconds, _STEP * resolution)

@@ -10,14 +10,10 @@ better known velocities.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import kalman
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.kalman import TrackStates
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 
 _MIN_P = (0.97, 0.95, 0.9, 0.8, 0.6, 0.4, 0.05)  # of joins, round by round
 _MAX_GAP = 4.0  # s

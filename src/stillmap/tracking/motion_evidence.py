@@ -15,9 +15,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.em.shape_evidence import find_lost_beams
 from stillmap.mapping import MoverPoints
@@ -30,8 +30,6 @@ from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.tracklets import join_tracklets
 from stillmap.tracking.walker_paths import count_steady_windows, iterate_walker_paths
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 Places = tuple[Index, Float]  # scans (n,) and positions (n, 2) of one track
 
 _MIN_P_DYNAMIC = 0.5  # of the beams that are judged
@@ -81,8 +79,8 @@ class TrackEvidence(NamedTuple):
 
 
 def apply_motion_evidence(
-    recording: Recording, poses: Float, p_static: NDArray[np.float32], noise_std: float
-) -> tuple[NDArray[np.float32], MoverPoints]:
+    recording: Recording, poses: Float, p_static: Float32, noise_std: float
+) -> tuple[Float32, MoverPoints]:
     """Labels of the beams, given what the tracks of the dynamic ones say.
 
     A beam is dynamic if its cell says so and its track does: 1 - e becomes (1 - e) P(mover). One
@@ -174,11 +172,7 @@ def _log_mean_power(successes: Float, failures: Float, a: float, b: float) -> Fl
 
 
 def collect_evidence(
-    recording: Recording,
-    T_map_sensor: Float,
-    points: DynamicPoints,
-    owner: Index,
-    noise_std: float,
+    recording: Recording, T_map_sensor: Float, points: DynamicPoints, owner: Index, noise_std: float
 ) -> tuple[Index, TrackEvidence]:
     """Track numbers (K,), rising, and what is known of each.
 
@@ -292,7 +286,7 @@ def _classify_visibility(
     return out
 
 
-def _classify_places(points: NDArray[np.float32], place: Float) -> Index:
+def _classify_places(points: Float32, place: Float) -> Index:
     """(n,) the Visibility of places (n, 2) in one scan, end points (N, 2), in the sensor frame."""
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):

@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.vehicle_filter import EdgeLooks, smooth_track
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _EDGE_STD, _ACCELERATION = 0.15, 2.0  # m, m2/s3: of the smoothed path
 _MIN_LENGTH, _MIN_WIDTH = 1.0, 0.8  # m, of what is seen as one beam
@@ -49,7 +46,7 @@ class MoverPath:
         )
         return x + (seconds - inside)[:, None] * v, v
 
-    def contains(self, seconds: Float, xy: Float, margin: float) -> NDArray[np.bool_]:
+    def contains(self, seconds: Float, xy: Float, margin: float) -> Bool:
         """(n,) whether points (n, 2) at times (n,) lie within the box and `margin` metres."""
         x, v = self.state_at(seconds)
         u = v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -24,9 +24,6 @@ from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.options import ObjectOptions
 from stillmap.tracking.tracklets import stitch_tracklets
 from stillmap.tracking.vehicle_filter import smooth_track
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 HEADING_SPEED = 0.3  # m/s: a faster object is heading where it moves
 
@@ -58,7 +55,7 @@ class MovingObject(ShortRepr):
 
     id: int
     scan: Index
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Int64
     xy: Float
     velocity: Float
     size: tuple[float, ...]
@@ -79,10 +76,7 @@ def mean_speed(velocity: Float) -> float:
 
 
 def track_objects(
-    recording: Recording,
-    poses: Float,
-    p_static: NDArray[np.float32],
-    options: ObjectOptions,
+    recording: Recording, poses: Float, p_static: Float32, options: ObjectOptions
 ) -> list[MovingObject]:
     """Detect and track the moving objects of a recording.
 
@@ -163,7 +157,7 @@ def _make_object(
     centroid: Float,
     paths: list[MoverPath],
     recording: Recording,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
 ) -> MovingObject:
     """The object of points `here` with these centroids (L, 2) in scans (L,)."""
     at = np.searchsorted(scan, points.scan[here])

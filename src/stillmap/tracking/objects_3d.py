@@ -8,9 +8,9 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.arrays import ArrayBuilder, take_rows, unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
@@ -21,9 +21,6 @@ from stillmap.tracking import MovingObject, ObjectOptions, track_objects
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
 from stillmap.tracking.displacement import drop_surface_parts, select_movers
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-
 _MIN_HEIGHT, _MAX_HEIGHT = 0.2, 3.0  # m above the ground
 _COLUMN = 0.3  # m, edge of the columns whose connected components are segments
 MIN_POINTS = 3  # of a segment: fewer are noise
@@ -33,7 +30,7 @@ _OUTLIERS = 2.0  # percent of the end points below the box, and above
 def track_objects_3d(
     recording: Recording,
     poses: Float,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
     ground: GroundMap,
     options: ObjectOptions,
     threads: int = 1,
@@ -81,9 +78,9 @@ class _Segments(NamedTuple):
         beam: (K,) their numbers, rising.
     """
 
-    points: NDArray[np.float32]
+    points: Float32
     nearest: Index
-    offset: NDArray[np.int64]
+    offset: Int64
     segment: Index
     beam: Index
 
@@ -92,7 +89,7 @@ def _segment_scans(
     recording: Recording,
     poses: Float,
     planar_poses: Float,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
     ground: GroundMap,
     min_p_dynamic: float,
     threads: int,
@@ -173,11 +170,7 @@ def _collect_beams(
 
 
 def _add_height(
-    one: MovingObject,
-    beams: Index,
-    recording: Recording,
-    poses: Float,
-    p_static: NDArray[np.float32],
+    one: MovingObject, beams: Index, recording: Recording, poses: Float, p_static: Float32
 ) -> MovingObject:
     """The object with all its beams, the height of its center in each scan, and of its box."""
     z = recording.end_points(beams, poses)[:, 2]

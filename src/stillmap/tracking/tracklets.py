@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.square_box import component_labels
 from stillmap.em.people_tracker import MIN_TRACK_SCANS
 from stillmap.tracking.association import HORIZON, regress_velocity
@@ -23,10 +23,6 @@ from stillmap.tracking.detections import (
 from stillmap.tracking.fast_movers import tracks_of_paths
 from stillmap.tracking.joins import Looks, join_pieces
 from stillmap.tracking.mover_path import MoverPath
-
-Index = NDArray[np.intp]
-Float = NDArray[np.float64]
-
 
 NO_PIECE = -1
 _NEAR = 0.6  # m between the centroids of two tracks: less than between people who pass
@@ -57,7 +53,7 @@ def cut_tracks(found: Centroids, seconds: Float, whole: Index) -> Index:
     return np.where(near, NO_PIECE, pieces)
 
 
-def _select_short_runs(at: Index, track: Index, t: Float) -> NDArray[np.bool_]:
+def _select_short_runs(at: Index, track: Index, t: Float) -> Bool:
     """(L,) which centroids lie within encounters; `at` (n,) are near others."""
     last = np.diff(track[at], append=-1) != 0
     last |= np.diff(t[at], append=np.inf) > _MAX_PAUSE

@@ -3,13 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import kalman
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MIN_SPEED, MAX_SPEED = 2.5, 30.0  # m/s: faster than walkers; slower than what anybody maps
 _STOPPED = 1.5  # m/s, below which it is left to the tracker of walkers
@@ -37,7 +34,7 @@ class EdgeLooks(NamedTuple):
     scan: Index
     xy: Float
     heading: Float
-    leads: NDArray[np.bool_]
+    leads: Bool
     length: float
     width: float
 

@@ -3,17 +3,14 @@
 from collections.abc import Container, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Index
 from stillmap.tracking.association import ACCELERATION
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.objects import SMOOTHER_STD, estimate_center_offset
 from stillmap.tracking.vehicle_filter import smooth_track
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _MIN_P_MOVER = 0.99  # what explains hits must be certain: clutter would make more of itself
 _WIDTH = 0.5  # m, of a person
@@ -78,9 +75,7 @@ def count_steady_windows(t: Float, xy: Float, period: float) -> tuple[float, flo
     return len(enough) / _OVERLAP, float(np.count_nonzero(whole & steady)) / _OVERLAP
 
 
-def _fit_lines(
-    t: Float, xy: Float, low: NDArray[np.intp], high: NDArray[np.intp]
-) -> tuple[Float, Float]:
+def _fit_lines(t: Float, xy: Float, low: Index, high: Index) -> tuple[Float, Float]:
     """Speed and rms distance (W,) of lines through detections low to high, over time."""
     terms = np.column_stack([t, t * t, xy, t[:, None] * xy, (xy**2).sum(axis=1)])
     sums = np.concatenate([np.zeros((1, terms.shape[1])), np.cumsum(terms, axis=0)])
