@@ -47,19 +47,19 @@ def chair_color(window):
 
 def test_last_session_is_shown_at_first(window):
     assert window._sessions.session == 3
-    assert "session 4 of 4" in window._session_controls._title.content
+    assert "session 4 of 4" in window._sessions._title.content
     assert window._clock.value == "0.0 of 4.0 s"
     assert list(window._boxes)[-3:] == PLACE_LAYERS
     assert [window._boxes[name].value for name in PLACE_LAYERS] == [True, True, False]
 
 
 def test_slider_shows_map_scans_and_changes_of_a_session(window):
-    window._session_controls._slider.value = 2
+    window._sessions._slider.value = 2
     window.step()
     assert window._sessions.session == 1
-    title = window._session_controls._title.content.replace("\\", "")
+    title = window._sessions._title.content.replace("\\", "")
     assert title == "**session 2 of 4: tuesday, 2026-05-29**"
-    assert "A0" in window._session_controls._table.content
+    assert "A0" in window._sessions._table.content
     assert chair_color(window) == KIND_COLORS["appeared"]
     assert node(window, "/robot/robot").position == pytest.approx([-2.0, 0.2, 0.0])
     path = node(window, "/robot/lines").points
@@ -84,15 +84,12 @@ def test_boxes_are_those_of_what_changed_since_the_session_before(window):
     assert shown == {0: [], 1: ["appeared"], 2: ["moved", "door"], 3: ["gone"]}
     window.show_session(2)
     moved = node(window, "/changes/moved").points
-    # the four sides of the box, the dots of where it was, the arrow and its head
-    assert len(moved) > 4 + 4 + 3
+    # the four sides of both boxes, the arrow and its head
+    assert len(moved) == 4 + 4 + 3
     assert moved[..., 0].min() == pytest.approx(1.95, abs=1e-3)
     assert moved[..., 0].max() == pytest.approx(3.05, abs=1e-3)
     window.show_session(3)
-    gone = node(window, "/changes/gone").points
-    assert len(gone) > 4  # dashes
-    lengths = np.linalg.norm(gone[:, 1] - gone[:, 0], axis=1)
-    assert 0.3 * 2.0 < lengths.sum() < 0.9 * 2.0
+    assert len(node(window, "/changes/gone").points) == 4
 
 
 def test_objects_are_those_of_the_session(window):

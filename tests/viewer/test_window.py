@@ -1,16 +1,17 @@
 """The viewer's layers and controls."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from stillmap.results.colors import ORANGE
+from stillmap.results.colors import BLUE, ORANGE, TEAL
 from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS
+from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS, legend_html
 
 
 def node(window, path):
@@ -133,19 +134,12 @@ def test_keys_are_distinct_and_not_those_of_the_camera(window):
     assert {*window._boxes, "Play or pause", "Measure"} <= set(window._actions())
 
 
-def test_click_on_a_box_that_is_gone_selects_nothing(window):
-    window.show(2)
-    window._objects._click_box(SimpleNamespace(instance_index=1))
-    window.step()
-    assert window._objects.selected is None
-    window._objects._click_box(SimpleNamespace(instance_index=0))
-    window.step()
-    assert window._objects.selected == 7
-
-
 def test_selected_object_shows_its_facts(window):
     window.show(2)
-    window._click_object(7)
+    window._objects._click_box(SimpleNamespace(instance_index=1))  # of a box that is gone
+    window.step()
+    assert not window._facts_folder.visible
+    window._objects._click_box(SimpleNamespace(instance_index=0))
     window.step()
     assert window._facts_folder.visible
     assert window._facts_folder.label == "Object 7"
@@ -158,3 +152,24 @@ def test_selected_object_shows_its_facts(window):
     window._actions()["Clear"]()
     window.step()
     assert not window._facts_folder.visible
+
+
+def test_legend_names_visible_layers_alone(window):
+    def seen():
+        window.step()
+        html = legend_html(window._layers, window._coloring.value)
+        found = re.findall(r"rgb\((\d+), (\d+), (\d+)\)", html)
+        return html, {tuple(map(int, one)) for one in found}
+
+    assert "rays" not in seen()[0]
+    window._boxes["Rays"].value = True
+    window._boxes["Objects"].value = False
+    html, colors = seen()
+    assert "rays from the sensor" in html
+    assert {TEAL, ORANGE, BLUE} <= colors
+    assert "moving objects" not in html
+    window._actions()["Legend"]()
+    assert not window._panel.visible
+    for box in window._boxes.values():
+        box.value = False
+    assert seen()[1] == set()

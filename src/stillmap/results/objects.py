@@ -1,6 +1,7 @@
-"""`objects/`: tracked objects as JSON and point clouds; `traffic.npz`: crossings and speeds."""
+"""`objects/`: tracked objects as JSON and point clouds; `traffic.npz`; poses along tracks."""
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,16 @@ from stillmap.core.arrays import write_npz
 from stillmap.core.local_frame import FAR
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.points import Fields, coordinate_fields, ply_header
+from stillmap.results.reader import Track
 from stillmap.tracking import FlowMap, MovingObject
 
 if TYPE_CHECKING:
     from stillmap.pipeline.tilting import TiltingResult
 
+Float = NDArray[np.float64]
+Mover = MovingObject | Track
+
+_MIN_SPEED = 0.2  # m/s from which a velocity gives the heading
 # of the cloud of an object
 OBJECT_FIELDS: Fields = [(name, "<f4") for name in ("x", "y", "z", "seconds", "p_dynamic")]
 MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
@@ -87,3 +93,34 @@ def write_traffic(path: Path, traffic: FlowMap) -> None:
             "resolution": np.asarray(traffic.resolution, np.float64),
         },
     )
+
+
+def headings(velocity: Float) -> Float:
+    """Headings (K,) in rad from velocities (K, 2), interpolated where an object stands."""
+    moving = np.flatnonzero(np.linalg.norm(velocity, axis=1) >= _MIN_SPEED)
+    if not len(moving):
+        return np.zeros(len(velocity))
+    angle = np.unwrap(np.arctan2(velocity[moving, 1], velocity[moving, 0]))
+    return np.asarray(np.interp(np.arange(len(velocity)), moving, angle))
+
+
+def interpolate_pose(track: Mover, stamp_ns: int) -> Float:
+    """T_map_object (4, 4) at a time, interpolated; constant beyond the ends of the track."""
+    # differences first: stamps in ns exceed the precision of float64
+    seconds = 1e-9 * (track.stamp_ns - stamp_ns)
+    x, y, angle = (np.interp(0.0, seconds, row) for row in (*track.xy.T, headings(track.velocity)))
+    T = np.eye(4)
+    T[0, :2], T[1, :2] = (np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))
+    T[:3, 3] = x, y, 0.0 if track.z is None else np.interp(0.0, seconds, track.z)
+    return T
+
+
+def iter_present_tracks(
+    tracks: Sequence[Mover], stamp_ns: NDArray[np.int64]
+) -> Iterator[list[int]]:
+    """For each of the rising stamps (T,), the indices of the tracks that span it."""
+    first = np.searchsorted(stamp_ns, np.array([one.stamp_ns[0] for one in tracks], np.int64))
+    last = np.array([one.stamp_ns[-1] for one in tracks], np.int64)
+    order = np.argsort(first, kind="stable")
+    for t, stamp in enumerate(stamp_ns):
+        yield order[(first[order] <= t) & (last[order] >= stamp)].tolist()

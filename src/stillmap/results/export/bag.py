@@ -26,7 +26,7 @@ from stillmap.io.ros.writer import (
     write_sensor_frames,
 )
 from stillmap.results.mapped_place import MappedPlace
-from stillmap.results.object_poses import Mover, interpolate_pose, iter_present_tracks
+from stillmap.results.objects import Mover, interpolate_pose, iter_present_tracks
 from stillmap.results.point_cloud import Block, cloud_from_recording
 from stillmap.results.points import FIELDS, PACKED_COLOUR, make_vertices
 

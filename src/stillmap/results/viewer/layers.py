@@ -22,8 +22,8 @@ from stillmap.results.viewer.beams import Beams
 from stillmap.results.viewer.measuring import Ray, pick_plane, pick_point
 from stillmap.results.viewer.nodes import NO_SHADOWS, Nodes, node_path
 from stillmap.results.viewer.objects import ObjectNodes
-from stillmap.results.viewer.scene import MAX_POINTS, Points, to_rgba
-from stillmap.results.viewer.sessions import SessionNodes
+from stillmap.results.viewer.scene import MAX_POINTS, MapImage, Points, to_rgba
+from stillmap.results.viewer.sessions import Sessions
 
 _MAX_TRAJECTORY_POINTS = 5_000
 _MAX_RAYS = 1_500
@@ -33,6 +33,7 @@ _POINT_SIZE, _FLAT_POINT_SIZE, _END_SIZE, _AXES_SIZE = 0.0009, 0.0014, 0.0022, 0
 _HEIGHT_QUANTILES = (0.02, 0.98)  # of the static points, at the ends of the color map
 
 LABEL, HEIGHT, PICTURES = "label", "height", "pictures"  # what points are colored by
+STATIC, DYNAMIC = "Static points", "Dynamic points"
 
 
 class Layers:
@@ -40,7 +41,6 @@ class Layers:
 
     Attributes:
         default_visibility: by name of the layer.
-        notes: by name, text to show with a visible layer.
         clouds: by name of the layer, relative to the scene's origin.
         colorings: what the points can be colored by; the first is the default.
         heights: lowest and highest of the color map of heights, in m in the map frame.
@@ -51,7 +51,7 @@ class Layers:
         nodes: Nodes,
         beams: Beams | None,
         objects: ObjectNodes,
-        sessions: SessionNodes | None = None,
+        sessions: Sessions | None = None,
     ) -> None:
         """Create the nodes.
 
@@ -65,56 +65,57 @@ class Layers:
         self._sessions = sessions
         self._points: dict[str, tuple[Any, float]] = {}
         self._parents: dict[str, Any] = {}
-        self.clouds = self._read_clouds()
+        self.default_visibility: dict[str, bool] = {}
+        self.clouds = dict(self._scene.clouds)
+        if self._scene.is_2d and beams is not None:  # the dynamic points are those of the recording
+            ends = beams.dynamic_ends(MAX_POINTS["dynamic"])
+            points = np.pad(ends, ((0, 0), (0, 1))) - nodes.origin(1)
+            self.clouds |= {DYNAMIC: Points(points.astype(np.float32), None)} if len(ends) else {}
         self.heights: tuple[float, float] = (0.0, 0.0)
         self.colorings: tuple[str, ...] = (LABEL,)
-        if (static := self.clouds.get("Static points")) is not None:
-            low, high = np.quantile(static.points[:, 2].astype(np.float64), _HEIGHT_QUANTILES)
-            self.heights = float(low + nodes.scene.origin[2]), float(high + nodes.scene.origin[2])
+        if (static := self.clouds.get(STATIC)) is not None:
+            z = static.points[:, 2].astype(np.float64)
+            low, high = (np.quantile(z, _HEIGHT_QUANTILES) + nodes.scene.origin[2]).tolist()
+            self.heights = low, high
             self.colorings = (LABEL, HEIGHT) + (PICTURES,) * (static.colors is not None)
-        self.default_visibility: dict[str, bool] = {}
-        self.notes = {
-            f"{name.capitalize()} points": f"{len(one.points):,} of {one.total:,} {name} points "
-            "are shown"
-            for name, one in self._scene.clouds.items()
-            if len(one.points) < one.total
-        }
         # light grey, so that white walls are visible
         nodes.server.scene.set_background_image(np.array([[BACKGROUND]], np.uint8), format="png")
-        for name, shown, exists, make in self._definitions():
-            if exists:
-                self.default_visibility[name] = shown
-                parent = nodes.server.scene.add_frame(node_path(name), False, visible=shown)
-                self._parents[name] = parent
-                make()
+        self._make_all()
 
-    def _definitions(self) -> list[tuple[str, bool, bool, Callable[[], None]]]:
-        """Name, default visibility, whether there is data, and the function that creates it."""
-        scene, beams, moving = self._scene, self._beams is not None, bool(self._scene.tracks)
-        static, dynamic = "Static points", "Dynamic points"
-        definitions = [
-            ("Map", True, scene.map_image is not None, self._make_map),
-            # it would cover the points
-            ("Surface", False, scene.surface is not None, self._make_surface),
-            (static, True, static in self.clouds, lambda: self._make_cloud(static)),
-            (dynamic, True, dynamic in self.clouds, lambda: self._make_cloud(dynamic)),
-            ("Robot", True, True, self._make_trajectory),
-            ("Beams", True, beams, self._make_beams),
-            ("Rays", False, beams, self._make_rays),
-            ("Objects", True, moving, self._objects.make_boxes),
-            ("Object tracks", False, moving, self._objects.make_tracks),
-            ("Object models", True, bool(scene.models), self._objects.make_models),
-            ("Object ids", False, moving, lambda: None),
-        ]
-        place, sessions = scene.place, self._sessions
-        if place is not None and sessions is not None:
-            several = len(place) > 1
-            definitions += [
-                ("Sessions", True, True, sessions.make_trajectories),
-                ("Changes", True, several, sessions.make_boxes),
-                ("Change labels", False, several, lambda: None),
-            ]
-        return definitions
+    def _make_all(self) -> None:
+        """Create the layers for which there is data."""
+        scene, sessions, objects = self._scene, self._sessions, self._objects
+        if scene.map_image is not None:
+            self._make_map(scene.map_image)
+        if scene.surface is not None:  # hidden at first: it would cover the points
+            self._add("Surface", lambda: self._make_surface(scene.surface), shown=False)
+        for name, cloud in self.clouds.items():
+            self._make_cloud(name, cloud)
+        self._add("Robot", self._make_trajectory)
+        if self._beams is not None:
+            self._add("Beams", self._make_beams)
+            self._add("Rays", self._make_rays, shown=False)
+        if scene.tracks:
+            self._add("Objects", objects.make_boxes)
+            self._add("Object tracks", objects.make_tracks, shown=False)
+        if scene.models:
+            self._add("Object models", objects.make_models)
+        if scene.tracks:
+            self._add("Object ids", shown=False)
+        if sessions is not None:
+            self._add("Sessions", sessions.make_trajectories)
+            if sessions.count > 1:
+                self._add("Changes", sessions.make_boxes)
+                self._add("Change labels", shown=False)
+
+    def _add(
+        self, name: str, make: Callable[[], object] = lambda: None, shown: bool = True
+    ) -> None:
+        """Add a layer, whose nodes `make` creates."""
+        self.default_visibility[name] = shown
+        parent = self._nodes.server.scene.add_frame(node_path(name), False, visible=shown)
+        self._parents[name] = parent
+        make()
 
     def is_shown(self, name: str) -> bool:
         """True if the layer exists and is visible."""
@@ -144,10 +145,10 @@ class Layers:
             ray: of a click.
             tangent: of the angle around it within which a point is met.
         """
-        shown = [name for name in self.clouds if self.is_shown(name)]
+        shown = {name for name in self.clouds if self.is_shown(name)}
         if self.is_shown("Surface"):  # the static points lie on it
-            shown.append("Static points")
-        clouds = [self.clouds[name].points for name in dict.fromkeys(shown) if name in self.clouds]
+            shown |= {STATIC} & self.clouds.keys()
+        clouds = [self.clouds[name].points for name in sorted(shown)]
         found = None if self._scene.is_2d else pick_point(ray, clouds, tangent)
         if found is None and self.is_shown("Map"):
             found = pick_plane(ray, self._map_height - float(self._scene.origin[2]))
@@ -158,39 +159,27 @@ class Layers:
         self._nodes.place(self._robot, self._scene.poses[scan])
         if self.is_shown("Beams") or self.is_shown("Rays"):
             self._draw_beams(scan)
-        self._objects.update(int(self._scene.stamp_ns[scan]), self.is_shown)
+        session = "" if self._sessions is None else self._sessions.name
+        self._objects.update(int(self._scene.stamp_ns[scan]), session, self.is_shown)
         if self._sessions is not None:
-            self._sessions.update(self.is_shown("Changes"), self.is_shown("Change labels"))
+            self._sessions.update(self.is_shown("Change labels"))
 
-    def show_session(self, session: int) -> None:
-        """Show the map and the trajectory of a session of a place."""
-        place = self._scene.place
-        assert place is not None
-        if place.pictures is not None:
-            drawn = place.pictures.draw(session)
+    def show_session(self, sessions: Sessions) -> None:
+        """Show the map and the trajectory of the chosen session of a place."""
+        if self._scene.pictures is not None:
+            drawn = self._scene.pictures.draw(sessions.session)
             self._map.image = to_rgba(drawn, transparent=not self._scene.is_2d)
-        self._path.points = self._trajectory(place.scans_of(session)).astype(np.float32)
-        self._objects.session = place.timeline.sessions[session].name
-
-    def _read_clouds(self) -> dict[str, Points]:
-        """Clouds by name of their layer; in 2D the dynamic points are those of the recording."""
-        clouds = {f"{name.capitalize()} points": one for name, one in self._scene.clouds.items()}
-        if self._scene.is_2d and self._beams is not None:
-            ends = self._beams.dynamic_ends(MAX_POINTS["dynamic"])
-            points = np.zeros((len(ends), 3)) - self._nodes.origin(1)
-            points[:, :2] += ends
-            clouds["Dynamic points"] = Points(points.astype(np.float32), None, len(ends))
-        return {name: one for name, one in clouds.items() if len(one.points)}
+        pieces = self._nodes.path_pieces(sessions.scans, 2, _MAX_TRAJECTORY_POINTS)
+        self._path.points = pieces.astype(np.float32)
 
     def _cloud_colors(self, name: str, cloud: Points, by: str) -> NDArray[np.uint8]:
         """(n, 3) of the points of a layer."""
-        static = name == "Static points"
         if by == PICTURES and cloud.colors is not None:
             colors = cloud.colors.copy()
-            if not static:  # grey where no picture shows them, which would look static
+            if name == DYNAMIC:  # grey where no picture shows them, which would look static
                 colors[(colors == GRAY).all(axis=1)] = ORANGE
             return colors
-        if not static:
+        if name == DYNAMIC:
             return np.full((len(cloud.points), 3), ORANGE, np.uint8)
         color = color_by_height if by == HEIGHT else color_static
         return color(cloud.points[:, 2] + self._scene.origin[2], *self.heights)
@@ -200,10 +189,10 @@ class Layers:
         """In m, in the map frame."""
         return self._scene.ground - (0.0 if self._scene.surface is None else _MAP_DEPTH)
 
-    def _make_map(self) -> None:
-        plan, scene = self._scene.map_image, self._scene
-        assert plan is not None
+    def _make_map(self, plan: MapImage) -> None:
+        self._add("Map")
         x0, y0, x1, y1 = plan.window
+        center = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), self._map_height])
         self._map: Any = self._nodes.server.scene.add_image(
             node_path("Map", "plan"),
             plan.picture,
@@ -213,34 +202,29 @@ class Layers:
             **NO_SHADOWS,
             # viser's images face -z
             wxyz=(0.0, 1.0, 0.0, 0.0),
-            position=np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), self._map_height]) - scene.origin,
+            position=center - self._scene.origin,
         )
 
-    def _make_surface(self) -> None:
-        assert self._scene.surface is not None
+    def _make_surface(self, surface: bytes | None) -> None:
         path = node_path("Surface", "mesh")
-        node = self._nodes.server.scene.add_glb(path, self._scene.surface, **NO_SHADOWS)
+        node = self._nodes.server.scene.add_glb(path, surface or b"", **NO_SHADOWS)
         self._nodes.place(node, gltf.MAP_FROM_GLTF)
 
-    def _make_cloud(self, name: str) -> None:
-        cloud, share = self.clouds[name], _FLAT_POINT_SIZE if self._scene.is_2d else _POINT_SIZE
-        colors = self._cloud_colors(name, cloud, self.colorings[0])
+    def _make_cloud(self, name: str, cloud: Points) -> None:
+        self._add(name)
+        share = _FLAT_POINT_SIZE if self._scene.is_2d else _POINT_SIZE
+        colors = self._cloud_colors(name, cloud, LABEL)
         node = self._nodes.cloud(name, cloud.points, colors, share)
         self._points[name] = node, node.point_size
 
     def _make_trajectory(self) -> None:
-        segments = self._trajectory(range(len(self._scene.poses)))
-        self._path = self._nodes.lines("Robot", segments, np.array(BLUE, np.uint8), 2.5)
+        whole = slice(0, len(self._scene.poses))
+        pieces = self._nodes.path_pieces(whole, 2, _MAX_TRAJECTORY_POINTS)
+        self._path = self._nodes.lines("Robot", pieces, BLUE, 2.5)
         length = _AXES_SIZE * self._nodes.height
         self._robot = self._nodes.server.scene.add_frame(
             node_path("Robot", "robot"), axes_length=length, axes_radius=0.06 * length
         )
-
-    def _trajectory(self, scans: range) -> NDArray[np.float64]:
-        """Line segments (n, 2, 3) between the poses of scans, relative to the scene's origin."""
-        positions = self._scene.poses[scans.start : scans.stop, :3, 3] - self._nodes.origin(2)
-        use = positions[sample_indices(len(positions), _MAX_TRAJECTORY_POINTS)]
-        return np.stack([use[:-1], use[1:]], axis=1)
 
     def _make_beams(self) -> None:
         points, colors = np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8)
@@ -248,8 +232,7 @@ class Layers:
         self._points["Beams"] = self._ends, self._ends.point_size
 
     def _make_rays(self) -> None:
-        none = np.zeros((1, 2, 3))
-        self._ray = self._nodes.lines("Rays", none, np.array(TEAL, np.uint8), 1.0)
+        self._ray = self._nodes.lines("Rays", np.zeros((1, 2, 3)), TEAL, 1.0)
 
     def _draw_beams(self, scan: int) -> None:
         assert self._beams is not None

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable
-from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,23 +64,23 @@ class Measuring:
         self,
         nodes: Nodes,
         pick: Callable[[Ray, float], Float | None],
-        events: SimpleQueue[Callable[[], None]],
+        defer: Callable[..., Callable[..., None]],
     ) -> None:
         """Add the controls.
 
         Args:
             nodes: draws what was measured.
             pick: the visible point that a ray meets; see `Layers.pick`.
-            events: takes what is to be done, in place of viser's threads.
+            defer: makes a callback for viser's threads that has a function called later.
         """
-        self._nodes, self._pick, self._events = nodes, pick, events
+        self._nodes, self._pick, self._defer = nodes, pick, defer
         self.active, self.points, self._drawn = False, list[Float](), list[Any]()
         gui = nodes.server.gui
         self._button = gui.add_button("Measure")
-        self._button.on_click(lambda _event: events.put(self.toggle))
+        self._button.on_click(defer(self.toggle))
         self._text: Any = gui.add_markdown("", visible=False)
         self._clear_button = gui.add_button("Clear", visible=False)
-        self._clear_button.on_click(lambda _event: events.put(self.clear))
+        self._clear_button.on_click(defer(self.clear))
 
     @property
     def distances(self) -> list[float]:
@@ -130,7 +129,7 @@ class Measuring:
         """Called by viser, in one of its threads."""
         ray = Ray(np.array(event.ray_origin), np.array(event.ray_direction))
         tangent = _CLICK_RADIUS * 2.0 * math.tan(0.5 * float(event.client.camera.fov))
-        self._events.put(lambda: self.add(ray, tangent))
+        self._defer(self.add, ray, tangent)()
 
     def _show(self, message: str = "") -> None:
         """Show the distances, and what the next click will be."""

@@ -10,11 +10,12 @@ import numpy as np
 import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import sample_indices
 from stillmap.results.viewer.scene import Scene
 from stillmap.results.viewer.server import Server
 
 FIELD_OF_VIEW = math.radians(60.0)  # vertical
-MIN_ASPECT = 1.1  # width / height of the page beside the controls
+_ASPECT = 1.1  # width / height of the page beside the controls, at least
 _MARGIN = 1.1
 _EXTENT_QUANTILES = (0.03, 0.97)  # of the points, without far outliers
 _DIRECTION_3D = np.array([-0.45, -0.7, 0.62])  # from the scene to the camera
@@ -23,6 +24,7 @@ _MIN_EXTENT = 5.0  # m
 Float = NDArray[np.float64]
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 _LAYER_STEP = 0.02  # m between the map and what is drawn on it in 2D
+TEXT_STYLE = "font-size:.8em;line-height:1.5;padding:0 .9em"
 
 
 class DefaultView(NamedTuple):
@@ -31,46 +33,33 @@ class DefaultView(NamedTuple):
     Attributes:
         position, look_at: (3,) m relative to the scene's origin.
         height: height of the view in m at `look_at`.
-        near, far: distances of the clipping planes in m.
+        distance: from the camera to `look_at` in m.
     """
 
-    position: NDArray[np.float64]
-    look_at: NDArray[np.float64]
+    position: Float
+    look_at: Float
     height: float
-    near: float
-    far: float
-
-    def position_for(self, aspect: float) -> NDArray[np.float64]:
-        """Position (3,) from which a page of this width / height shows as much."""
-        further = max(1.0, MIN_ASPECT / aspect)
-        return np.asarray(self.look_at + further * (self.position - self.look_at))
+    distance: float
 
 
 def default_view(scene: Scene) -> DefaultView:
     """The camera that shows the whole scene: 2D from above, north up; 3D at a slant."""
-    low, high = _bounds(scene)
-    center, (width, height) = 0.5 * (low + high), np.maximum(high - low, _MIN_EXTENT)[:2]
-    shown = _MARGIN * max(height, width / MIN_ASPECT) * (1.0 if scene.is_2d else _SCALE_3D)
-    distance = 0.5 * shown / math.tan(0.5 * FIELD_OF_VIEW)
-    if scene.is_2d:
-        # not exactly vertical, which would leave the direction of north undefined
-        offset = np.array([0.0, -0.01, 1.0]) * distance
-    else:
-        offset = _DIRECTION_3D / np.linalg.norm(_DIRECTION_3D) * distance
-    return DefaultView(center + offset, center, shown, 2e-3 * distance, 20.0 * distance)
-
-
-def _bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner (3,) of the visible content in m, relative to the scene's origin."""
-    static = scene.clouds.get("static")
-    if static is not None and len(static.points):
+    static = scene.clouds.get("Static points")
+    if static is not None:
         low, high = np.quantile(static.points.astype(np.float64), _EXTENT_QUANTILES, axis=0)
-        return low, high
-    positions = scene.poses[:, :3, 3] - scene.origin
-    if scene.map_image is None:
-        return np.asarray(positions.min(axis=0)), np.asarray(positions.max(axis=0))
-    x0, y0, x1, y1 = scene.map_image.window
-    return np.array([x0, y0, 0.0]) - scene.origin, np.array([x1, y1, 0.0]) - scene.origin
+    else:
+        seen = scene.poses[:, :3, 3]
+        if scene.map_image is not None:
+            x0, y0, x1, y1 = scene.map_image.window
+            seen = np.array([[x0, y0, 0.0], [x1, y1, 0.0]])
+        low, high = seen.min(axis=0) - scene.origin, seen.max(axis=0) - scene.origin
+    center, (width, height) = 0.5 * (low + high), np.maximum(high - low, _MIN_EXTENT)[:2]
+    shown = _MARGIN * max(height, width / _ASPECT) * (1.0 if scene.is_2d else _SCALE_3D)
+    distance = 0.5 * shown / math.tan(0.5 * FIELD_OF_VIEW)
+    # in 2D not exactly vertical, which would leave the direction of north undefined
+    direction = np.array([0.0, -0.01, 1.0]) if scene.is_2d else _DIRECTION_3D
+    offset = distance * direction / np.linalg.norm(direction)
+    return DefaultView(center + offset, center, shown, distance)
 
 
 class Nodes:
@@ -112,12 +101,22 @@ class Nodes:
         )
 
     def lines(
-        self, layer: str, pieces: Float, colors: NDArray[np.uint8], pixels: float, part: str = ""
+        self, layer: str, pieces: Float, colors: Any, pixels: float, part: str = "lines"
     ) -> Any:
         """Line segments (n, 2, 3) in m, relative to the scene's origin; colors (3,) or alike."""
-        points, path = pieces.astype(np.float32), node_path(layer, part or "lines")
-        add = self.server.scene.add_line_segments
-        return add(path, points, colors, thickness=pixels, thickness_units="screen")
+        return self.server.scene.add_line_segments(
+            node_path(layer, part),
+            pieces.astype(np.float32),
+            np.asarray(colors, np.uint8),
+            thickness=pixels,
+            thickness_units="screen",
+        )
+
+    def path_pieces(self, scans: slice, level: int, most: int) -> Float:
+        """Line segments (n, 2, 3) between at most so many poses of scans, at a level."""
+        positions = self.scene.poses[scans, :3, 3] - self.origin(level)
+        use = positions[sample_indices(len(positions), most)]
+        return np.stack([use[:-1], use[1:]], axis=1)
 
     def label(self, path: str) -> Any:
         """A text above its position, empty at first."""
@@ -154,9 +153,6 @@ def quaternions(R: Float) -> Float:
 def node_path(layer: str, part: str = "") -> str:
     """Path of a layer's node, or of a node below it."""
     return "/" + layer.lower().replace(" ", "_") + (f"/{part}" if part else "")
-
-
-TEXT_STYLE = "font-size:.8em;line-height:1.5;padding:0 .9em"
 
 
 def escape_markdown(text: str) -> str:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,8 @@ from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
-from stillmap.results.object_poses import interpolate_pose
-from stillmap.results.point_cloud import Cloud, Part, cloud_from_folder
+from stillmap.results.objects import interpolate_pose
+from stillmap.results.point_cloud import Part, cloud_from_folder
 from stillmap.results.reader import SESSIONS, Grid, Track, is_place, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
 from stillmap.results.report.place_pictures import PlacePictures
@@ -35,44 +35,19 @@ _MIN_IMAGE_SIZE = 2_000  # pixels; browsers blur smaller images
 Value = TypeVar("Value")
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
-    """A subsampled point cloud.
+class Points(NamedTuple):
+    """A point cloud.
 
     Attributes:
-        points: (n, 3) m in the map frame.
+        points: (n, 3) float32 m, relative to the origin of the scene.
         colors: (n, 3) uint8; None where the file has none.
-        total: number of points in the file.
     """
 
-    points: NDArray[np.floating]
+    points: NDArray[np.float32]
     colors: NDArray[np.uint8] | None
-    total: int
 
 
-@dataclass(frozen=True, eq=False)
-class ViewedPlace:
-    """A place of several sessions.
-
-    Attributes:
-        timeline: the sessions in the order of time, and what changed between them.
-        pictures: of the map; None for an empty one.
-    """
-
-    timeline: Timeline
-    pictures: PlacePictures | None
-
-    def __len__(self) -> int:
-        return len(self.timeline.sessions)
-
-    def scans_of(self, session: int) -> range:
-        """Indices of the scans of a session in the scene."""
-        scans = self.timeline.sessions[session].scans
-        return range(scans.start, scans.stop)
-
-
-@dataclass(frozen=True, eq=False)
-class MapImage:
+class MapImage(NamedTuple):
     """The 2D map as an image.
 
     Attributes:
@@ -84,30 +59,21 @@ class MapImage:
     window: Window
 
 
-@dataclass(frozen=True, eq=False)
-class Model:
-    """The mesh of a moving object.
-
-    Attributes:
-        data: the .glb file.
-        T_map_gltf: (4, 4) pose at `stamp_ns`.
-        track: its track.
-    """
+class Model(NamedTuple):
+    """The mesh of a moving object: a .glb file, its track, and its pose (4, 4) in that."""
 
     data: bytes
-    T_map_gltf: Float
-    stamp_ns: int
     track: Track
+    T_track_gltf: Float
 
     def pose_at(self, stamp_ns: int) -> Float:
-        """T_map_gltf (4, 4) at another time, along the track."""
-        now, then = (interpolate_pose(self.track, at) for at in (stamp_ns, self.stamp_ns))
-        return np.asarray(now @ inverse(then) @ self.T_map_gltf)
+        """T_map_gltf (4, 4) at a time, along the track."""
+        return np.asarray(interpolate_pose(self.track, stamp_ns) @ self.T_track_gltf)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A result of T scans.
+    """A result of T scans, or a place.
 
     Attributes:
         name: name of the recording.
@@ -115,15 +81,15 @@ class Scene:
         stamp_ns: (T,).
         poses: (T, 4, 4) T_map_base.
         map_image: None for an empty map.
-        clouds: by name: `static`, `dynamic`; float32, relative to `origin`. Colors are those of
-            pictures; None where there are none.
+        clouds: by name of the layer, without empty ones; colors are those of pictures.
         tracks: moving objects.
         surface: mesh.glb; None where there is none.
         models: of the tracks that have one.
         origin: (3,) whole m in the map frame; everything is drawn relative to it.
         ground: height of the map image in m.
         notes: what cannot be shown, and why.
-        place: the sessions of a place; None: a single result.
+        timeline: of a place; None: a single result.
+        pictures: of the map of a place; None for an empty one.
     """
 
     name: str
@@ -131,19 +97,16 @@ class Scene:
     stamp_ns: NDArray[np.int64]
     poses: Float
     map_image: MapImage | None
-    clouds: dict[Part, Points]
+    clouds: dict[str, Points]
     tracks: list[Track]
     surface: bytes | None
     models: list[Model]
     origin: Float
     ground: float
+    is_2d: bool
     notes: list[str] = field(default_factory=list)
-    place: ViewedPlace | None = None
-
-    @property
-    def is_2d(self) -> bool:
-        """True if there are neither clouds nor a mesh."""
-        return not self.clouds and self.surface is None
+    timeline: Timeline | None = None
+    pictures: PlacePictures | None = None
 
 
 def read_scene(folder: Path, recording: str = "") -> Scene:
@@ -156,7 +119,7 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
     Raises:
         InputError: map or trajectory are missing, or a file is damaged.
     """
-    place, grid = None, read_grid(folder)
+    grid, timeline, pictures = read_grid(folder), None, None
     stamp_ns, poses = read_tum(folder / "trajectory.tum")
     if is_place(folder):
         timeline = read_timeline(folder)
@@ -164,41 +127,28 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
             what = "is damaged: its scans are not those of the place"
             raise InputError(what, where=str(folder / SESSIONS))
         pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
-        place = ViewedPlace(timeline, pictures)
-    origin = _origin(poses)
-    raw = {
-        part: _sample(cloud_from_folder(folder, part), most)
-        for part, most in MAX_POINTS.items()
-        if (folder / f"{part}.ply").exists()
-    }
-    tracks, notes = read_tracks(folder / "objects" / "objects.json"), list[str]()
-    surface = None
+    origin, notes = _origin(poses), list[str]()
+    clouds = _read_clouds(folder, origin, notes)
+    tracks, surface = read_tracks(folder / "objects" / "objects.json"), None
     if (folder / "mesh.glb").exists():
         surface = _read_or_note(notes, gltf.read_glb, folder / "mesh.glb", _MAX_MESH)
-    models = _models(folder / "objects", tracks, notes)
     return Scene(
         name=recording or folder.resolve().name,
         folder=folder.resolve().name,
         stamp_ns=stamp_ns,
         poses=poses,
-        map_image=_map_image(grid, place, transparent=bool(raw)),
-        clouds={
-            name: Points((one.points - origin).astype(np.float32), one.colors, one.total)
-            for name, one in raw.items()
-        },
+        map_image=_map_image(grid, pictures, transparent=bool(clouds)),
+        clouds={name: one for name, one in clouds.items() if len(one.points)},
         tracks=tracks,
         surface=surface,
-        models=models,
+        models=_read_models(folder / "objects", tracks, notes),
         origin=origin,
-        ground=_ground(raw.get("static"), poses),
+        ground=_ground(clouds.get("Static points"), poses, origin),
+        is_2d=not clouds and surface is None,
         notes=notes,
-        place=place,
+        timeline=timeline,
+        pictures=pictures,
     )
-
-
-def _sample(cloud: Cloud, most: int) -> Points:
-    block = cloud.sample(most)
-    return Points(block.points, block.colors, cloud.count)
 
 
 def _origin(poses: Float) -> Float:
@@ -208,14 +158,26 @@ def _origin(poses: Float) -> Float:
     return np.asarray(np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0))))
 
 
-def _map_image(grid: Grid, place: ViewedPlace | None, transparent: bool) -> MapImage | None:
+def _read_clouds(folder: Path, origin: Float, notes: list[str]) -> dict[str, Points]:
+    """The clouds that a folder has, by name of their layer."""
+    clouds = {}
+    for part, most in MAX_POINTS.items():
+        if (folder / f"{part}.ply").exists():
+            cloud = cloud_from_folder(folder, part)
+            block = cloud.sample(most)
+            local = (block.points - origin).astype(np.float32)
+            clouds[f"{part.capitalize()} points"] = Points(local, block.colors)
+            if len(local) < cloud.count:
+                notes.append(f"{len(local):,} of {cloud.count:,} {part} points are shown")
+    return clouds
+
+
+def _map_image(grid: Grid, pictures: PlacePictures | None, transparent: bool) -> MapImage | None:
     if not grid.p_occupied.size:
         return None
-    if place is not None and place.pictures is not None:
-        last = place.pictures.draw(len(place) - 1)
-        return MapImage(to_rgba(last, transparent), place.pictures.view.window)
-    window = map_window([grid])
-    return MapImage(to_rgba(draw_map(grid, window), transparent), window)
+    window = map_window([grid]) if pictures is None else pictures.view.window
+    drawn = draw_map(grid, window) if pictures is None else pictures.draw_map()
+    return MapImage(to_rgba(drawn, transparent), window)
 
 
 def to_rgba(drawn: Image.Image, transparent: bool) -> NDArray[np.uint8]:
@@ -232,41 +194,39 @@ def to_rgba(drawn: Image.Image, transparent: bool) -> NDArray[np.uint8]:
     return picture.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _ground(static: Points | None, poses: Float) -> float:
+def _ground(static: Points | None, poses: Float, origin: Float) -> float:
     """Height of the floor in m, from the static points around the trajectory."""
-    if static is None or not len(static.points):
+    if static is None:
         return 0.0
-    xy, way = static.points[:, :2], poses[:, :2, 3]
+    xy, way = static.points[:, :2], poses[:, :2, 3] - origin[:2]
     low, high = way.min(axis=0) - _GROUND_RADIUS, way.max(axis=0) + _GROUND_RADIUS
-    z = static.points[((xy > low) & (xy < high)).all(axis=1), 2]
-    return float(np.quantile(z, _GROUND_QUANTILE)) if len(z) else 0.0
+    z = static.points[((xy > low) & (xy < high)).all(axis=1), 2].astype(np.float64)
+    return float(np.quantile(z, _GROUND_QUANTILE) + origin[2]) if len(z) else 0.0
 
 
-def _models(folder: Path, tracks: list[Track], notes: list[str]) -> list[Model]:
+def _read_models(folder: Path, tracks: list[Track], notes: list[str]) -> list[Model]:
     """The models of the longest tracks, up to `_MAX_MODELS` bytes."""
     models, left = list[Model](), _MAX_MODELS
     for track in sorted(tracks, key=lambda one: int(one.stamp_ns[0] - one.stamp_ns[-1])):
         path = folder / f"{track.id:04d}.glb"
-        if path.exists():
-            model = _read_or_note(notes, _model, path, track, left)
-            if model is not None:
-                models.append(model)
-                left -= len(model.data)
+        model = _read_or_note(notes, _read_model, path, track, left) if path.exists() else None
+        if model is not None:
+            models.append(model)
+            left -= len(model.data)
     return models
 
 
-def _model(path: Path, track: Track, max_bytes: int) -> Model:
-    data = gltf.read_glb(path, max_bytes)
-    record_path = path.with_suffix(".json")
+def _read_model(path: Path, track: Track, max_bytes: int) -> Model:
+    data, record_path = gltf.read_glb(path, max_bytes), path.with_suffix(".json")
     try:
         record = read_json(record_path, _MAX_RECORD)
         T = np.array(record["T_map_object"], np.float64).reshape(4, 4)
-        stamp_ns = int(record["stamp_ns"])
+        then = interpolate_pose(track, int(record["stamp_ns"]))
+        if not np.isfinite(T).all() or not math.isclose(np.linalg.det(T), 1.0, abs_tol=1e-3):
+            raise ValueError("T_map_object is not a pose")
     except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise InputError(f"is damaged: {error!r}", where=str(record_path)) from error
-    if not np.isfinite(T).all() or not math.isclose(np.linalg.det(T), 1.0, abs_tol=1e-3):
-        raise InputError("T_map_object is not a pose", where=str(record_path))
-    return Model(data, T @ gltf.MAP_FROM_GLTF, stamp_ns, track)
+    return Model(data, track, inverse(then) @ T @ gltf.MAP_FROM_GLTF)
 
 
 def _read_or_note(notes: list[str], read: Callable[..., Value], *arguments: object) -> Value | None:

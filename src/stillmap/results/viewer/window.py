@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -11,17 +11,10 @@ from numpy.typing import NDArray
 
 from stillmap.results.viewer.beams import Beams
 from stillmap.results.viewer.layers import Layers
-from stillmap.results.viewer.legend import (
-    ACTION_KEYS,
-    LAYER_KEYS,
-    LegendPanels,
-    help_html,
-    legend_html,
-)
+from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS, help_html, legend_html
 from stillmap.results.viewer.measuring import Measuring
 from stillmap.results.viewer.nodes import (
     FIELD_OF_VIEW,
-    MIN_ASPECT,
     Nodes,
     default_view,
     escape_markdown,
@@ -30,11 +23,12 @@ from stillmap.results.viewer.nodes import (
 from stillmap.results.viewer.objects import ObjectNodes, describe_object
 from stillmap.results.viewer.scene import Scene
 from stillmap.results.viewer.server import start_server, stop_server
-from stillmap.results.viewer.sessions import SessionControls, SessionNodes
+from stillmap.results.viewer.sessions import Sessions
 
 _FRAME_TIME = 0.1  # s between updates while playing
 _IDLE_TIME = 0.05  # s between polls of the controls
 _SPEEDS = {"1 x": 1.0, "3 x": 3.0, "10 x": 10.0, "30 x": 30.0, "100 x": 100.0}
+_LEGEND_MARGIN, _LEGEND_WIDTH = 15, 215  # pixels: to the borders of the page; of the panel
 
 
 class Window:
@@ -53,31 +47,24 @@ class Window:
             InputError: the port is taken.
         """
         self._scene, self._view = scene, default_view(scene)
-        self._scans = range(len(scene.stamp_ns))  # of a place, those of the session that is shown
-        self._seconds = self._measure_seconds()
-        self.scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._server = start_server(port, f"{scene.name} - stillmap")
         try:
-            camera = self._server.initial_camera
-            camera.fov, camera.far, camera.near = FIELD_OF_VIEW, self._view.far, self._view.near
+            camera, distance = self._server.initial_camera, self._view.distance
+            camera.fov, camera.far, camera.near = FIELD_OF_VIEW, 20.0 * distance, 2e-3 * distance
             camera.position, camera.look_at = self._view.position, self._view.look_at
             nodes = Nodes(self._server, scene, self._view.height)
-            self._objects = ObjectNodes(nodes, self._click_object)
-            place, self._sessions = scene.place, None
-            if place is not None:
-                self._sessions = SessionNodes(nodes, place)
-            self._layers = Layers(nodes, beams, self._objects, self._sessions)
-            self._legends = LegendPanels(self._server)
-            self._add_controls(nodes)
+            self._objects = ObjectNodes(nodes, lambda number: self._defer(self._select, number)())
+            self._add_controls(nodes, beams)
             for action, act in self._actions().items():
                 is_layer = action in LAYER_KEYS
                 label = f"Show or hide: {action.lower()}" if is_layer else action
                 key: Any = (LAYER_KEYS | ACTION_KEYS)[action]
-                self._server.gui.add_command(label, hotkey=key).on_trigger(act)
-            self.show(0)
-            if place is not None:
-                self.show_session(len(place) - 1)
+                self._server.gui.add_command(label, hotkey=key).on_trigger(self._defer(act))
+            if self._sessions is None:
+                self._show_scans(slice(0, len(scene.stamp_ns)))
+            else:
+                self.show_session(self._sessions.count - 1)
         except BaseException:
             self.close()
             raise
@@ -97,29 +84,27 @@ class Window:
         with self._server.atomic():
             self._slider.value = scan
             self._clock.value = f"{self._seconds[scan]:.1f} of {self._seconds[-1]:.1f} s"
-            self._layers.update(self._scans[scan])
+            self._layers.update(self._first + scan)
             self._show_facts()
 
     def show_session(self, session: int) -> None:
         """Show a session of a place from its first scan."""
-        place, nodes, controls = self._scene.place, self._sessions, self._session_controls
-        if place is None or nodes is None or controls is None:
-            return
-        nodes.session, self._scans = session, place.scans_of(session)
-        self._seconds = self._measure_seconds()
-        last = len(self._scans) - 1
-        with self._server.atomic():
-            self._slider.max, self._slider.disabled = max(last, 1), not last
-            self._button.disabled = not last
-            self._layers.show_session(session)
-            controls.show()
-            self._at = 0.0
-            self.show(0)
+        if self._sessions is not None:
+            with self._server.atomic():
+                self._sessions.choose(session)
+                self._layers.show_session(self._sessions)
+                self._show_scans(self._sessions.scans)
 
-    def _measure_seconds(self) -> NDArray[np.float64]:
-        """When each scan was taken, since the first one."""
-        stamps = self._scene.stamp_ns[self._scans.start : self._scans.stop]
-        return np.asarray(1e-9 * (stamps - stamps[0]))
+    def _show_scans(self, scans: slice) -> None:
+        """Let the controls choose among these scans, and show the first one."""
+        self._stamp_ns: NDArray[np.int64] = self._scene.stamp_ns[scans]
+        self._first = scans.start
+        self._seconds = 1e-9 * (self._stamp_ns - self._stamp_ns[0])
+        last = len(self._stamp_ns) - 1
+        self._slider.max, self._slider.disabled = max(last, 1), not last
+        self._button.disabled = not last
+        self._at, self._playing, self._ticked = 0.0, False, time.monotonic()
+        self.show(0)
 
     def play(self, playing: bool) -> None:
         """Start or pause the playback."""
@@ -133,29 +118,26 @@ class Window:
             InputError: the recording can no longer be read.
         """
         time.sleep(_FRAME_TIME if self._playing else _IDLE_TIME)
-        self._handle_events()
+        for _ in range(self._events.qsize()):
+            self._events.get()()
         now = time.monotonic()
         passed, self._ticked = now - self._ticked, now
-        controls = self._session_controls
-        if controls and self._sessions and controls.wanted != self._sessions.session:
-            self.show_session(controls.wanted)
+        sessions = self._sessions
+        if sessions is not None and sessions.wanted != sessions.session:
+            self.show_session(sessions.wanted)
         # a page may still name a scan of a longer session
-        wanted = min(int(self._slider.value), len(self._scans) - 1)
+        wanted = min(int(self._slider.value), len(self._seconds) - 1)
         if wanted != self.scan:  # the slider was moved
             self._at = float(self._seconds[wanted])
         elif self._playing:
             wanted = self._advance(passed)
         self._layers.scale_points(self._size.value)
         changed = [self._layers.set_visible(name, box.value) for name, box in self._boxes.items()]
-        if any(changed):
-            for name, note in self._notes.items():
-                note.visible = self._boxes[name].value
         if wanted != self.scan or any(changed):
             self.show(wanted)
-        legend = legend_html(self._layers, self._coloring.value, self._scene.is_2d)
-        for client in self._legends.update(legend):
-            if client.camera.aspect < MIN_ASPECT:  # on a phone
-                self._set_camera(client)
+        legend = legend_html(self._layers, self._coloring.value)
+        if self._legend.content != legend:
+            self._legend.content = legend
 
     def _advance(self, passed: float) -> int:
         """The scan after `passed` s of playback; the first one after the last."""
@@ -164,40 +146,29 @@ class Window:
             self._at = 0.0
         return int(np.searchsorted(self._seconds, self._at, side="right")) - 1
 
-    def _handle_events(self) -> None:
-        while True:
-            try:
-                event = self._events.get_nowait()
-            except Empty:
-                return
-            event()
-
-    def _defer(self, act: Callable[[], None]) -> Callable[..., None]:
+    def _defer(self, act: Callable[..., None], *arguments: Any) -> Callable[..., None]:
         """A callback for viser that lets `step` act."""
-        return lambda *_event: self._events.put(act)
+        return lambda *_event: self._events.put(partial(act, *arguments))
 
-    def _actions(self) -> dict[str, Callable[..., None]]:
+    def _actions(self) -> dict[str, Callable[[], None]]:
         """The actions of keys, by name of the action or layer."""
-        last = len(self._seconds) - 1
         actions: dict[str, Callable[[], None]] = {
             "Play or pause": lambda: self.play(not self._playing),
             # not from `scan`: keys may be pressed faster than scans are shown
             "Next scan": lambda: self._go_to(int(self._slider.value) + 1),
             "Previous scan": lambda: self._go_to(int(self._slider.value) - 1),
             "First scan": lambda: self._go_to(0),
-            "Last scan": lambda: self._go_to(last),
+            "Last scan": lambda: self._go_to(len(self._seconds) - 1),
             "Measure": self._measuring.toggle,
             "Clear": self._clear,
             "Default view": self._reset_cameras,
-            "Legend": self._legends.toggle,
+            "Legend": lambda: _toggle(self._panel, "visible"),
         }
-        controls = self._session_controls
-        if controls is not None:
-            actions["Next session"] = lambda: controls.go_to(controls.wanted + 1)
-            actions["Previous session"] = lambda: controls.go_to(controls.wanted - 1)
-        for name, box in self._boxes.items():
-            actions[name] = partial(_toggle, box)
-        return {name: self._defer(act) for name, act in actions.items()}
+        sessions = self._sessions
+        if sessions is not None:
+            actions["Next session"] = lambda: sessions.go_to(sessions.wanted + 1)
+            actions["Previous session"] = lambda: sessions.go_to(sessions.wanted - 1)
+        return actions | {name: partial(_toggle, box) for name, box in self._boxes.items()}
 
     def _go_to(self, scan: int) -> None:
         """Pause at the scan that is nearest to an index."""
@@ -206,18 +177,10 @@ class Window:
 
     def _reset_cameras(self) -> None:
         for client in self._server.get_clients().values():
-            self._set_camera(client)
-
-    def _set_camera(self, client: Any) -> None:
-        """Show a page the default view."""
-        with client.atomic():
-            client.camera.up_direction = np.array([0.0, 0.0, 1.0])
-            client.camera.position = self._view.position_for(client.camera.aspect)
-            client.camera.look_at = self._view.look_at
-
-    def _click_object(self, number: int) -> None:
-        """Called by viser."""
-        self._events.put(lambda: self._select(number))
+            with client.atomic():
+                client.camera.up_direction = np.array([0.0, 0.0, 1.0])
+                client.camera.position = self._view.position
+                client.camera.look_at = self._view.look_at
 
     def _select(self, number: int | None) -> None:
         """Show the facts of an object; None: of none."""
@@ -229,7 +192,7 @@ class Window:
         found = [one for one in self._scene.tracks if one.id == self._objects.selected]
         self._facts_folder.visible = bool(found)
         for track in found:
-            now, start = (int(self._scene.stamp_ns[self._scans[n]]) for n in (self.scan, 0))
+            now, start = (int(self._stamp_ns[n]) for n in (self.scan, 0))
             self._facts_folder.label = f"Object {track.id}"
             self._facts.content = table_html(describe_object(track, now, start))
 
@@ -240,37 +203,29 @@ class Window:
         self._measuring.clear()
         self._select(None)
 
-    def _add_controls(self, nodes: Nodes) -> None:
-        gui, last, scene = self._server.gui, len(self._seconds) - 1, self._scene
+    def _add_controls(self, nodes: Nodes, beams: Beams | None) -> None:
+        gui, scene = self._server.gui, self._scene
         gui.set_panel_label("stillmap")
         gui.main_panel.dock_right()  # beside the scene, not over it
         name, folder = escape_markdown(scene.name), escape_markdown(scene.folder)
         gui.add_markdown(f"**{name}**" if name == folder else f"**{name}**, result {folder}")
-        self._session_controls: SessionControls | None = None
-        if scene.place is not None and self._sessions is not None:
-            self._session_controls = SessionControls(gui, scene.place, self._sessions)
+        self._sessions = None if scene.timeline is None else Sessions(nodes, scene.timeline)
+        self._layers = Layers(nodes, beams, self._objects, self._sessions)
         # Any: viser's types do not allow setting values
-        self._slider: Any = gui.add_slider("Scan", 0, max(last, 1), 1, 0, disabled=not last)
+        self._slider: Any = gui.add_slider("Scan", 0, 1, 1, 0)
         self._clock: Any = gui.add_text("Time", "", disabled=True)
         self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS))
-        self._button = gui.add_button("Play", disabled=not last)
+        self._button = gui.add_button("Play")
         self._button.on_click(self._defer(lambda: self.play(not self._playing)))
-        self._measuring = Measuring(nodes, self._layers.pick, self._events)
+        self._measuring = Measuring(nodes, self._layers.pick, self._defer)
         self._facts_folder: Any = gui.add_folder("Object", visible=False)
         with self._facts_folder:
             self._facts: Any = gui.add_html("")
-            gui.add_button("Close").on_click(self._defer(lambda: self._select(None)))
-        self._add_layer_controls()
-        for note in scene.notes:
-            gui.add_markdown(escape_markdown(note))
-        gui.add_html(help_html(is_place=scene.place is not None))
-
-    def _add_layer_controls(self) -> None:
-        gui, visible = self._server.gui, self._layers.default_visibility
+            gui.add_button("Close").on_click(self._defer(self._select, None))
         with gui.add_folder("Show"):
             self._boxes: dict[str, Any] = {
                 name: gui.add_checkbox(f"{LAYER_KEYS[name]} {name}", shown)
-                for name, shown in visible.items()
+                for name, shown in self._layers.default_visibility.items()
             }
             colorings = self._layers.colorings
             self._coloring = gui.add_dropdown("Points by", colorings, visible=len(colorings) > 1)
@@ -278,11 +233,15 @@ class Window:
                 self._defer(lambda: self._layers.color_points(self._coloring.value))
             )
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
-        self._notes = {
-            name: gui.add_markdown(escape_markdown(note), visible=visible[name])
-            for name, note in self._layers.notes.items()
-        }
+        for note in scene.notes:
+            gui.add_markdown(escape_markdown(note))
+        gui.add_html(help_html(is_place=scene.timeline is not None))
+        self._panel: Any = gui.add_panel()
+        self._panel.float(x=_LEGEND_MARGIN, y=-_LEGEND_MARGIN, width=_LEGEND_WIDTH)
+        with self._panel.add_tab("Legend"):
+            self._legend: Any = gui.add_html("")
 
 
-def _toggle(box: Any) -> None:
-    box.value = not box.value
+def _toggle(control: Any, name: str = "value") -> None:
+    """Switch a control or a panel on or off."""
+    setattr(control, name, not getattr(control, name))
