@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from stillmap.sim import OdometryOptions, Scene, scene_by_name
+from stillmap.sim import Scene, scene_by_name
+from stillmap.sim.options import OdometryOptions
 
 POPULATED = "populated"
 STOPS = "everyone stops"

@@ -35,15 +35,9 @@ from common import (
 from model_scores import score_model
 from tables import Column, means_and_worst
 
-from stillmap.sim import (
-    load_image_truth,
-    scene_by_name,
-    simulate,
-    simulate_rig,
-    write_rig,
-    write_simulation,
-)
+from stillmap.sim import scene_by_name, simulate, simulate_rig, write_rig, write_simulation
 from stillmap.sim.camera import SKY
+from stillmap.sim.truth import load_image_truth
 
 _CAMERA: dict[str, Any] = {"enabled": True, "rate": 2.0}
 # a SICK's scan in half of its turn, and a joint that goes up and down in 4 s

@@ -30,7 +30,8 @@ import stillmap
 from stillmap.core import config
 from stillmap.pipeline.tilting import PlanarResult, TiltingResult, build_tilting
 from stillmap.results.eval.labels import score_labels
-from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
+from stillmap.sim import scene_by_name, simulate_rig
+from stillmap.sim.simulator import RigSimulation
 
 WORLDS: dict[str, dict[str, Any]] = {
     "hall": {"crowd": {"people": 30}},

@@ -6,14 +6,8 @@ from pathlib import Path
 import numpy as np
 
 import stillmap
-from stillmap.sim import (
-    CrowdOptions,
-    LaserOptions,
-    RobotOptions,
-    Scene,
-    simulate,
-    write_simulation,
-)
+from stillmap.sim import Scene, simulate, write_simulation
+from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
 OPTIONS = {"threads": 1, "em.max_iterations": 2}

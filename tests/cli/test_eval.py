@@ -12,17 +12,8 @@ from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import write_tum
 from stillmap.results.map_server import write_map_npz
 from stillmap.results.reader import Grid
-from stillmap.sim import (
-    CrowdOptions,
-    LaserOptions,
-    RobotOptions,
-    Scene,
-    scene_by_name,
-    simulate,
-    simulate_rig,
-    write_rig,
-    write_simulation,
-)
+from stillmap.sim import Scene, scene_by_name, simulate, simulate_rig, write_rig, write_simulation
+from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
 RESOLUTION = 0.1

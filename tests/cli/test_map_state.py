@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from stillmap.cli.main import main
-from stillmap.sim import (
-    CrowdOptions,
-    LaserOptions,
-    RobotOptions,
-    Scene,
-    Stay,
-    Thing,
-    simulate,
-    write_simulation,
-)
+from stillmap.sim import Scene, simulate, write_simulation
+from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
+from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
 
 CRATE = tuple(box(0, 0, 1.0, 0.8))

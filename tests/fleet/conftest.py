@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from stillmap.cli.main import main
-from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate, write_simulation
+from stillmap.sim import Scene, simulate, write_simulation
+from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, Simulation, simulate
+from stillmap.sim import Scene, Simulation, simulate
+from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))

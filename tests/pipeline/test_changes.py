@@ -11,17 +11,9 @@ from stillmap.core.config import override
 from stillmap.mapping.changed_objects import cell_keys, find_shown_cells, pool_states
 from stillmap.pipeline.options import Options
 from stillmap.results.map_server import CHANGED, changed_cells
-from stillmap.sim import (
-    CrowdOptions,
-    Door,
-    DoorOptions,
-    LaserOptions,
-    RobotOptions,
-    Scene,
-    Stay,
-    Thing,
-    simulate,
-)
+from stillmap.sim import Scene, simulate
+from stillmap.sim.options import CrowdOptions, DoorOptions, LaserOptions, RobotOptions
+from stillmap.sim.scene import Door, Stay, Thing
 from stillmap.sim.walls import box
 from stillmap.tracking.motion_evidence import apply_motion_evidence
 

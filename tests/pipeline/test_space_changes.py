@@ -11,7 +11,8 @@ from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
 from stillmap.results.writer import save
-from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
+from stillmap.sim import Scene, simulate
+from stillmap.sim.options import CrowdOptions, LidarOptions, RobotOptions
 from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
 

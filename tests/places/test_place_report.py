@@ -23,14 +23,8 @@ from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import MapView
 from stillmap.results.report.place import place_marks, render_place_report
 from stillmap.results.timeline import read_timeline
-from stillmap.sim import (
-    CrowdOptions,
-    LaserOptions,
-    RobotOptions,
-    Scene,
-    simulate,
-    write_simulation,
-)
+from stillmap.sim import Scene, simulate, write_simulation
+from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
 

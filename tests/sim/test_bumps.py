@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import LaserOptions, RobotOptions, Simulation, scene_by_name, simulate
+from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.sim.laser import Returns
+from stillmap.sim.options import LaserOptions, RobotOptions
 from stillmap.sim.planar import FLOOR, Bumps, add_floor, find_blind_scans, simulate_bumps
 
 Float = NDArray[np.float64]

@@ -12,19 +12,11 @@ from true_surfaces import place_parts, project_to_solid, project_to_static
 from stillmap import io as recordings
 from stillmap.core.camera import project
 from stillmap.core.errors import InputError
-from stillmap.sim import (
-    RigSimulation,
-    Scene,
-    Simulation,
-    compute_static_color,
-    load_image_truth,
-    scene_by_name,
-    simulate,
-    simulate_rig,
-    write_rig,
-)
-from stillmap.sim.camera import SKY, compute_pixel_rays, place_cameras
+from stillmap.sim import Scene, Simulation, scene_by_name, simulate, simulate_rig, write_rig
+from stillmap.sim.camera import SKY, compute_pixel_rays, compute_static_color, place_cameras
 from stillmap.sim.options import CameraOptions
+from stillmap.sim.simulator import RigSimulation
+from stillmap.sim.truth import load_image_truth
 
 Float = NDArray[np.float64]
 
@@ -73,22 +65,22 @@ def test_pixels_show_the_true_surfaces_in_their_colours(
 ) -> None:
     made = request.getfixturevalue(which)
     one = made.tilting if which == "rig" else made
-    assert one.surfaces is not None
+    assert one.photographs is not None
     assert one.recording.images is not None
-    movers = 0
+    surfaces, movers = one.photographs.truth(), 0
     for image in range(len(one.recording.images)):
         places, mask = _seen(one, image)
         static = places[mask == 0]
-        off, _ = project_to_static(one.surfaces.standing, static)
+        off, _ = project_to_static(surfaces.standing, static)
         assert off.max() < 1e-4  # float32 of 100 m
-        near = np.linalg.norm(static - one.surfaces.T_world_camera[image, :3, 3], axis=1) < 3.0
+        near = np.linalg.norm(static - surfaces.T_world_camera[image, :3, 3], axis=1) < 3.0
         shows = one.recording.images.read(image)[mask == 0][near].astype(float)
-        wanted = compute_static_color(static[near], one.surfaces.colour_seed).astype(float)
+        wanted = compute_static_color(static[near], surfaces.colour_seed).astype(float)
         # but for places beside an edge of the texture, and what is averaged within a pixel
         assert np.median(np.abs(shows - wanted)) <= 6.0
         stamp = int(one.recording.images.stamp_ns[image])
         for number in np.unique(mask[(mask > 0) & (mask != SKY)]).tolist():
-            moving, at = one.surfaces.moving, places[mask == number]
+            moving, at = surfaces.moving, places[mask == number]
             solids = place_parts(moving, moving.parts(number - 1), stamp)
             gaps = [project_to_solid(at, solids, k) - at for k in range(len(solids.form))]
             # a person's legs swing between two scans
@@ -97,25 +89,19 @@ def test_pixels_show_the_true_surfaces_in_their_colours(
     assert movers > 0
 
 
-def test_sky_is_where_no_ray_ends(street: Simulation) -> None:
+def test_a_ring_of_cameras_looks_all_around_and_sees_the_sky(street: Simulation) -> None:
+    images = street.recording.images
+    assert images is not None
     assert street.photographs is not None
     shot = street.photographs.render(0)
     assert np.array_equal(shot.mask == SKY, np.isinf(shot.distance))
     assert 0.1 < np.mean(shot.mask == SKY) < 0.7
     r, _, b = np.median(shot.color[shot.mask == SKY], axis=0)
-    assert b > 200
-    assert b > r
-
-
-def test_a_ring_of_cameras_looks_all_around(street: Simulation) -> None:
-    images = street.recording.images
-    assert images is not None
-    ahead, behind = images.cameras
-    assert ahead.T_base_camera is not None
-    assert behind.T_base_camera is not None
-    assert np.allclose(ahead.T_base_camera[:2, 2], -behind.T_base_camera[:2, 2])
-    assert ahead.model == "plumb_bob"
-    assert np.array_equal(ahead.distortion[:4], list(LENS.values()))
+    assert b > max(r, 200)
+    ahead, behind = (np.asarray(camera.T_base_camera) for camera in images.cameras)
+    assert np.allclose(ahead[:2, 2], -behind[:2, 2])
+    assert images.cameras[0].model == "plumb_bob"
+    assert np.array_equal(images.cameras[0].distortion[:4], list(LENS.values()))
     assert np.array_equal(images.camera[:4], [0, 1, 0, 1])
     assert images.stamp_ns[0] == images.stamp_ns[1] < images.stamp_ns[2]
 
@@ -172,17 +158,14 @@ def test_folders_hold_pictures_and_their_truth(rig: RigSimulation, tmp_path: Pat
     truth, made = load_image_truth(tmp_path / "rig/tilting"), rig.tilting
     assert images is not None
     assert made.recording.images is not None
-    assert made.surfaces is not None
+    assert made.photographs is not None
+    surfaces = made.photographs.truth()
     assert np.array_equal(images.read(2), made.recording.images.read(2))
-    assert np.array_equal(truth.mask(2), made.surfaces.mask(2))
+    assert np.array_equal(truth.mask(2), surfaces.mask(2))
     near = np.isfinite(truth.distance(2))
-    assert np.allclose(truth.distance(2)[near], made.surfaces.distance(2)[near], atol=6e-4)
-    assert np.array_equal(truth.T_world_camera, made.surfaces.T_world_camera)
+    assert np.allclose(truth.distance(2)[near], surfaces.distance(2)[near], atol=6e-4)
+    assert np.array_equal(truth.T_world_camera, surfaces.T_world_camera)
     assert truth.colour_seed == made.truth.scene["colour_seed"]
     points = np.random.default_rng(0).uniform(-20, 20, (100, 3))
-    for found, wanted in zip(
-        project_to_static(truth.standing, points),
-        project_to_static(made.surfaces.standing, points),
-        strict=True,
-    ):
-        assert np.array_equal(found, wanted)
+    found, wanted = (project_to_static(one.standing, points) for one in (truth, surfaces))
+    assert all(map(np.array_equal, found, wanted))

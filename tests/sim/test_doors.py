@@ -7,9 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core.config import override
-from stillmap.sim import Door, DoorOptions, Scene, Simulation, simulate
+from stillmap.sim import Scene, Simulation, simulate
 from stillmap.sim.dynamics import Doors, split_into_segments
+from stillmap.sim.options import DoorOptions
 from stillmap.sim.planner import compute_segment_distance
+from stillmap.sim.scene import Door
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]

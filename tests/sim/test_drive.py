@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import Light, RobotOptions, Simulation
+from stillmap.sim import Simulation
+from stillmap.sim.options import RobotOptions
+from stillmap.sim.scene import Light
 from stillmap.sim.vehicles import SpeedProfile
 
 Float = NDArray[np.float64]

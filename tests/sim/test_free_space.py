@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.sim.planner import FreeSpace, Planner, compute_segment_distance
-from stillmap.sim.walls import Opening, box, room, wall
+from stillmap.sim.walls import Opening, box, polyline, wall
 
 
 def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> None:
@@ -44,7 +44,7 @@ def test_only_the_part_that_can_be_reached_counts() -> None:
 def test_a_room_behind_an_open_door_can_be_entered_and_a_niche_cannot() -> None:
     door = Opening(4.0, is_open=True)
     walls = [*wall((0, 0), 10, "south", [door, Opening(7.0)]), *box(5, 5, 10, 10)[1:]]
-    walls += room((0, 0), "south", (2, 8), 3.0, door)
+    walls += polyline([(4, -0.2), (2, -0.2), (2, -3.2), (8, -3.2), (8, -0.2), (5, -0.2)])
     inside = np.array([3.0, -2.0])
     planner = Planner(FreeSpace(np.array(walls)), np.array([5.0, 5.0]), 0.36)
     np.testing.assert_allclose(planner.point(np.array(planner.node(inside))), inside, atol=0.15)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import LaserOptions
 from stillmap.sim.laser import (
     Movers,
     Outlines,
@@ -15,6 +14,7 @@ from stillmap.sim.laser import (
     compute_beam_angles,
     simulate_measurement,
 )
+from stillmap.sim.options import LaserOptions
 
 Float = NDArray[np.float64]
 

@@ -8,8 +8,9 @@ from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.sim import OdometryOptions, Simulation, scene_by_name, simulate
+from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.sim.episode import add_faults
+from stillmap.sim.options import OdometryOptions
 
 Float = NDArray[np.float64]
 

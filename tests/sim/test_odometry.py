@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.sim import OdometryOptions
 from stillmap.sim.episode import simulate_odometry
+from stillmap.sim.options import OdometryOptions
 
 PERFECT = OdometryOptions(0.0, 0.0, 0.4, 0.0, 0.0, 0.0)
 

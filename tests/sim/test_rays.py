@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import LidarOptions, ray_casting
+from stillmap.sim import ray_casting
 from stillmap.sim.geometry import (
     BOX,
     CYLINDER,
@@ -18,6 +18,7 @@ from stillmap.sim.geometry import (
     make_pose,
 )
 from stillmap.sim.lidar import Pattern, transform_rays
+from stillmap.sim.options import LidarOptions
 from stillmap.sim.ray_casting import RayReturns, Rays, Window
 
 Float = NDArray[np.float64]

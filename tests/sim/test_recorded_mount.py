@@ -8,15 +8,9 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.results.eval.readers import read_truth
-from stillmap.sim import (
-    OdometryOptions,
-    Simulation,
-    load_truth,
-    scene_by_name,
-    simulate,
-    write_simulation,
-)
+from stillmap.sim import Simulation, load_truth, scene_by_name, simulate, write_simulation
 from stillmap.sim.episode import delay_odometry, simulate_odometry
+from stillmap.sim.options import OdometryOptions
 
 Float = NDArray[np.float64]
 PERFECT = OdometryOptions(0.0, 0.0, 0.4, 0.0, 0.0, 0.0)

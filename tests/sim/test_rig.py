@@ -8,14 +8,9 @@ import pytest
 
 from stillmap import io as recordings
 from stillmap.core.errors import InputError
-from stillmap.sim import (
-    RigOptions,
-    RigSimulation,
-    load_truth,
-    scene_by_name,
-    simulate_rig,
-    write_rig,
-)
+from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
+from stillmap.sim.options import RigOptions
+from stillmap.sim.simulator import RigSimulation
 
 
 @functools.cache

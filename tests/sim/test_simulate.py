@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
-from stillmap.sim import SCENES, CrowdOptions, Scene, Simulation, scene_by_name, simulate
+from stillmap.sim import SCENES, Scene, Simulation, scene_by_name, simulate
+from stillmap.sim.options import CrowdOptions
 from stillmap.sim.people import Crowd, Figures
 from stillmap.sim.planner import FreeSpace, Planner
 from stillmap.sim.walls import box

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.config import override
-from stillmap.sim import LaserOptions, Scene, Simulation, simulate
+from stillmap.sim import Scene, Simulation, simulate
 from stillmap.sim.dynamics import Motion
 from stillmap.sim.laser import Movers, Outlines
+from stillmap.sim.options import LaserOptions
 from stillmap.sim.planar import Sweep, cast_sweeps
 from stillmap.sim.walls import box, pillar
 

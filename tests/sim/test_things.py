@@ -8,18 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core.config import override
-from stillmap.sim import (
-    Scene,
-    Simulation,
-    Stay,
-    Thing,
-    load_truth,
-    scene_by_name,
-    simulate,
-    write_simulation,
-)
+from stillmap.sim import Scene, Simulation, load_truth, scene_by_name, simulate, write_simulation
 from stillmap.sim.dynamics import faces_at_all_places, place_faces
 from stillmap.sim.planner import compute_segment_distance
+from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import Lane, Light, TrafficOptions
+from stillmap.sim.options import TrafficOptions
+from stillmap.sim.scene import Lane, Light
 from stillmap.sim.vehicles import Traffic
 
 Float = NDArray[np.float64]

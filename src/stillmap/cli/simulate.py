@@ -176,7 +176,7 @@ def run(args: argparse.Namespace) -> int:
 def _simulate(scene: "Scene", args: argparse.Namespace, output: Path) -> list[dict[str, Any]]:
     """Simulate and write; returns the counts of each recording."""
     from stillmap.core.files import require_new, workplace
-    from stillmap.sim import sessions, simulate, simulate_rig, writer
+    from stillmap.sim import sessions, simulate, simulate_rig, simulator
 
     is_carmen, is_rig = args.format == "carmen", scene.rig.tilts
     if is_carmen and scene.in_3d:
@@ -191,17 +191,17 @@ def _simulate(scene: "Scene", args: argparse.Namespace, output: Path) -> list[di
             return sessions.write_sessions(
                 [plan], output, seed=args.seed, overwrite=args.overwrite, tell=progress
             )
-    require_new(output, writer.RIG_MARK if is_rig else writer.MARK, args.overwrite)
+    require_new(output, simulator.RIG_MARK if is_rig else simulator.MARK, args.overwrite)
     with show_share(args.quiet, "simulating") as progress:
         if is_rig:
             rig = simulate_rig(scene, args.seed, progress, workplace(output))
         else:
             made = simulate(scene, args.seed, progress, workplace(output))
     if is_rig:
-        writer.write_rig(rig, output, overwrite=args.overwrite)
-        return [writer.count_beams(part) for part in (rig.horizontal, rig.tilting)]
-    writer.write_simulation(made, output, format=args.format, overwrite=args.overwrite)
-    return [writer.count_beams(made)]
+        simulator.write_rig(rig, output, overwrite=args.overwrite)
+        return [simulator.count_beams(part) for part in (rig.horizontal, rig.tilting)]
+    simulator.write_simulation(made, output, format=args.format, overwrite=args.overwrite)
+    return [simulator.count_beams(made)]
 
 
 def _flag_changes(args: argparse.Namespace) -> dict[str, Any]:

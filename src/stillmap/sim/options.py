@@ -1,9 +1,9 @@
 """Parameters of a scene: sensors, robot, odometry, people, doors, vehicles, ground and heights."""
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stillmap.core.config import STRICT, Count, option
@@ -14,8 +14,8 @@ NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 _TURN = 2 * math.pi + 1e-9
-_MAX_ELEVATION = math.radians(85.0)
-Elevation = Annotated[float, Field(ge=-_MAX_ELEVATION, le=_MAX_ELEVATION)]
+MAX_ELEVATION = math.radians(85.0)
+Elevation = Annotated[float, Field(ge=-MAX_ELEVATION, le=MAX_ELEVATION)]
 _MAX_CAMERA_FOV = math.radians(150.0)
 
 # degrees, elevations of the lowest and highest channel of common sensors, by number of channels
@@ -26,18 +26,6 @@ def require(condition: bool, message: str) -> None:
     """Raise ValueError(message) unless the condition holds."""
     if not condition:
         raise ValueError(message)
-
-
-def ascending(*pairs: tuple[str, str]) -> Any:
-    """A validator of options of which the first of each pair must not exceed the second."""
-
-    def check(options: Any) -> Any:
-        for low, high in pairs:
-            is_ordered = getattr(options, low) <= getattr(options, high)
-            require(is_ordered, f"{low} must not exceed {high}")
-        return options
-
-    return model_validator(mode="after")(check)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -52,8 +40,6 @@ class CrowdOptions:
     min_stop: NotNegative = option(2.0, "Minimum duration of a stop, s.")
     max_stop: NotNegative = option(20.0, "Maximum duration of a stop, s.")
 
-    _check = ascending(("min_speed", "max_speed"), ("min_stop", "max_stop"))
-
 
 @dataclass(frozen=True, config=STRICT)
 class DoorOptions:
@@ -65,8 +51,6 @@ class DoorOptions:
     max_closed: Positive = option(120.0, "Maximum time a door stays closed, s.")
     swing: Positive = option(1.5, "Time from closed to open, s.")
 
-    _check = ascending(("min_open", "max_open"), ("min_closed", "max_closed"))
-
 
 @dataclass(frozen=True, config=STRICT)
 class TrafficOptions:
@@ -77,8 +61,6 @@ class TrafficOptions:
     max_speed: Positive = option(12.0, "Maximum desired speed, m/s.")
     stopping_share: Share = option(0.2, "Share of vehicles that stop at times.")
     max_stop: float = option(12.0, "Maximum duration of a stop, s.", ge=3)
-
-    _check = ascending(("min_speed", "max_speed"))
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -111,14 +93,14 @@ class LaserOptions:
     blind_time: Positive = option(30.0, "Duration of a stretch without returns, s.")
 
     @property
-    def recorded_mount(self) -> tuple[float, float, float]:
+    def recorded_mount(self) -> tuple[float, ...]:
         """x, y, yaw as the recorder has them."""
-        x, y, yaw = self.recorded_x, self.recorded_y, self.recorded_yaw
-        return (
-            self.x if x is None else x,
-            self.y if y is None else y,
-            self.yaw if yaw is None else yaw,
+        pairs = (
+            (self.recorded_x, self.x),
+            (self.recorded_y, self.y),
+            (self.recorded_yaw, self.yaw),
         )
+        return tuple(true if recorded is None else recorded for recorded, true in pairs)
 
     @property
     def count(self) -> int:
@@ -230,13 +212,6 @@ class LidarOptions:
     roof_width: Positive | None = option(None, "Width of the roof, m; unset: 0.8 of that.")
     roof_below: Positive = option(0.35, "Height of the sensor above the roof, m.")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        """Refuses an empty field of view."""
-        low, high = self.field
-        require(low <= high, "elevations must satisfy low <= high")
-        return self
-
     @property
     def field(self) -> tuple[float, float]:
         """rad, elevations of the lowest and highest channel."""
@@ -255,13 +230,6 @@ class RigOptions:
     middle: float = option(0.1, "Mean tilt, nose down, rad.")
     amplitude: NotNegative = option(0.7, "Tilt to either side of the mean, rad.")
     period: Positive = option(4.0, "Period of the tilting at constant rate, s.")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        """Refuses too large angles."""
-        angle = abs(self.middle) + self.amplitude
-        require(angle <= _MAX_ELEVATION, "the laser must not tilt by more than 85 degrees")
-        return self
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -88,9 +88,10 @@ def _find_standing_things(
     return np.where(stands, of_wall[exact.wall], np.int32(-1)).ravel()
 
 
-def _mounts(o: LaserOptions, pose: tuple[float, float, float]) -> Float:
+def _mounts(o: LaserOptions, pose: tuple[float, ...]) -> Float:
     """(S, 3, 3) T_base_sensor of the lasers, the first of which is at x, y, yaw."""
-    front = se2.matrix(*pose)
+    x, y, yaw = pose
+    front = se2.matrix(x, y, yaw)
     return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from stillmap.sim.options import (
+    MAX_ELEVATION,
     CameraOptions,
     CrowdOptions,
     DoorOptions,
@@ -180,8 +181,17 @@ class Scene:
             require(not self.lidar.channels, "a rig of two lasers has no lidar")
             usual = not self.laser.second_laser and self.laser.upside_down == "no"
             require(usual, "a rig has one upright horizontal laser")
+        angle = abs(self.rig.middle) + self.rig.amplitude
+        require(angle <= MAX_ELEVATION, "the laser must not tilt by more than 85 degrees")
+        lowest, highest = self.lidar.field
+        require(lowest <= highest, "elevations must satisfy low <= high")
         can_see = self.in_3d or not self.camera.enabled
         require(can_see, "cameras need a 3D world: a lidar, or a tilting laser")
+        for section in (self.crowd, self.doors, self.traffic):
+            for low in [name for name in vars(section) if name.startswith("min_")]:
+                high = low.replace("min_", "max_")
+                is_ordered = getattr(section, low) <= getattr(section, high)
+                require(is_ordered, f"{low} must not exceed {high}")
 
     @property
     def in_3d(self) -> bool:

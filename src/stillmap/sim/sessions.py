@@ -16,9 +16,8 @@ from stillmap.sim.options import HeightOptions
 from stillmap.sim.planner import Float, FreeSpace, Planner
 from stillmap.sim.scene import Point, Scene
 from stillmap.sim.session_layout import Layout, StandingObject
-from stillmap.sim.simulator import Simulation, simulate
+from stillmap.sim.simulator import Simulation, count_beams, simulate, write_folder
 from stillmap.sim.world_3d import make_parts, trace_loops
-from stillmap.sim.writer import count_beams, write_folder
 
 SESSIONS_FILE = "sessions.json"
 SESSIONS_MARK = "session-1/truth"  # every folder of simulated sessions has it, no place does

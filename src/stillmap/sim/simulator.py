@@ -1,18 +1,23 @@
-"""Simulation of a recording: motion, odometry, sensors and cameras."""
+"""Simulation of a recording, and the folder with its truth that it is written to."""
 
-import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder, write_npy
 from stillmap.core.errors import InputError
+from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
-from stillmap.sim import lidar
-from stillmap.sim.camera import CameraSimulator
+from stillmap.io import stillmap_folder
+from stillmap.io.carmen.writer import write_log
+from stillmap.io.registry import RIG_FOLDERS
+from stillmap.sim import lidar, truth
+from stillmap.sim.camera import CameraSimulator, Color
 from stillmap.sim.dynamics import Progress
 from stillmap.sim.episode import simulate_episode
 from stillmap.sim.geometry import make_pose
@@ -20,9 +25,12 @@ from stillmap.sim.laser import Float, simulate_measurement
 from stillmap.sim.lidar import Sensor
 from stillmap.sim.planar import record_planar
 from stillmap.sim.scene import Scene
-from stillmap.sim.truth import ImageTruth, Truth
+from stillmap.sim.truth import Truth
 from stillmap.sim.world_3d import STANDING, World
 
+CARMEN_LOG = "recording.log"
+MARK = "truth"  # every simulation has it
+RIG_MARK = "tilting/truth"  # every one of two lasers has it
 _MOTION_SHARE = 0.7  # of the computing time, for progress
 _MOTION_SHARE_3D = 0.05  # the same with a lidar
 
@@ -36,14 +44,12 @@ class Simulation:
         recording: the recording; its images are rendered on access.
         truth: of the beams.
         photographs: the camera images with their truth; None without cameras.
-        surfaces: the truth about images and surfaces.
     """
 
     scene: Scene
     recording: Recording
     truth: Truth
     photographs: CameraSimulator | None = None
-    surfaces: ImageTruth | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +95,8 @@ def simulate(
     if scene.rig.tilts:
         raise InputError("a rig of two lasers makes two recordings", hint="simulate_rig")
     share = _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
-    first, rest = _split_progress((0.0, share, 1.0), progress)
-    episode = simulate_episode(scene, np.random.default_rng(rng), first)
+    rest = _part(progress, share, 1.0)
+    episode = simulate_episode(scene, np.random.default_rng(rng), _part(progress, 0.0, share))
     if scene.in_3d:
         world, sensor = World.of(episode), lidar.make_spinning_lidar(scene)
         made = _with_images(world, *_record(world, sensor, episode.sensor_rng, rest, scratch))
@@ -112,26 +118,21 @@ def simulate_rig(
     """
     if not scene.rig.tilts:
         raise InputError("no laser of the scene tilts", hint="rig.tilts=true")
-    ends = (0.0, _MOTION_SHARE_3D, (1 + _MOTION_SHARE_3D) / 2, 1.0)
-    first, second, third = _split_progress(ends, progress)
-    episode = simulate_episode(scene, np.random.default_rng(rng), first)
+    first, middle = _MOTION_SHARE_3D, (1 + _MOTION_SHARE_3D) / 2
+    episode = simulate_episode(scene, np.random.default_rng(rng), _part(progress, 0.0, first))
     world, (flat, tilted) = World.of(episode), lidar.make_rig_lasers(scene)
-    below = _record(world, flat, episode.sensor_rng, second, scratch)
-    above = _record(world, tilted, episode.body_rng, third, scratch)
+    below = _record(world, flat, episode.sensor_rng, _part(progress, first, middle), scratch)
+    above = _record(world, tilted, episode.body_rng, _part(progress, middle, 1.0), scratch)
     # images belong to the 3D recording
     horizontal, tilting = Simulation(scene, *below), _with_images(world, *above)
-    third(1.0)
+    _part(progress, middle, 1.0)(1.0)
     stamps = np.arange(len(episode.motion.robot)) / scene.scan_rate
     return RigSimulation(horizontal, tilting, lidar.compute_joint_angle(stamps, scene.rig))
 
 
-def _split_progress(ends: tuple[float, ...], tell: Progress | None) -> list[Progress]:
-    """Progress of each part of the whole."""
-
-    def part(first: float, last: float) -> Progress:
-        return lambda share: tell(first + (last - first) * share) if tell else None
-
-    return [part(*pair) for pair in itertools.pairwise(ends)]
+def _part(progress: Progress | None, first: float, last: float) -> Progress:
+    """Progress of a part of the whole."""
+    return lambda share: progress(first + (last - first) * share) if progress else None
 
 
 def _with_images(world: World, recording: Recording, truth: Truth) -> Simulation:
@@ -141,7 +142,7 @@ def _with_images(world: World, recording: Recording, truth: Truth) -> Simulation
         return Simulation(scene, recording, truth)
     photographs = CameraSimulator(world)
     recording = replace(recording, images=photographs.images)
-    return Simulation(scene, recording, truth, photographs, photographs.truth())
+    return Simulation(scene, recording, truth, photographs)
 
 
 def _record(
@@ -149,10 +150,12 @@ def _record(
 ) -> tuple[Recording, Truth]:
     """The recording of a sensor of a 3D world, scan by scan in bounded memory, with its truth."""
     episode, T, dimension = world.episode, len(world.robot), sensor.dimension
+    has_things, offset = episode.has_standing_things, [0]
     points = ArrayBuilder(np.float32, (dimension,), scratch)
-    hits, statics = (ArrayBuilder(np.bool_, (), scratch) for _ in range(2))
-    movers, things = (ArrayBuilder(np.int32, (), scratch) for _ in range(2))
-    times, offset = ArrayBuilder(np.float32, (), scratch), [0]
+    types = {"hit": np.bool_, "static": np.bool_, "mover": np.int32, "thing": np.int32}
+    beams = {
+        name: ArrayBuilder(t, (), scratch) for name, t in (*types.items(), ("time", np.float32))
+    }
     for scan in range(T):
         pattern = sensor.pattern(scan)
         exact = sensor.cast_rays(world, pattern, scan)
@@ -162,16 +165,17 @@ def _record(
         use = hit if sensor.leaves_out else np.ones_like(hit)
         local = (ranges * pattern.direction[:dimension]).astype(np.float32)
         points.append(np.moveaxis(local, 0, -1)[use])
-        hits.append(hit[use])
-        statics.append((hit & (mover == -1))[use])
-        movers.append(mover[use])
-        if episode.has_standing_things:
-            things.append(np.where(hit & stands, STANDING - exact.mover, -1)[use].astype(np.int32))
+        values = {"hit": hit, "static": hit & (mover == -1), "mover": mover}
+        if has_things:
+            values["thing"] = np.where(hit & stands, STANDING - exact.mover, -1)
         if sensor.takes_time:
-            times.append(np.repeat(pattern.seconds, hit.shape[1]).reshape(hit.shape)[use])
-        offset.append(len(hits))
+            values["time"] = np.broadcast_to(pattern.seconds[:, None], hit.shape)
+        for name, of_beams in values.items():
+            beams[name].append(of_beams[use])
+        offset.append(len(points))
         if scan % 10 == 0:
             tell(scan / T)
+    made = {name: builder.finish() for name, builder in beams.items()}
     if dimension == 2:
         T_world_base, T_odom_base = se2.matrix(*episode.motion.robot.T), episode.T_odom_base
         T_base_sensor = sensor.T_base_sensor[np.ix_([0, 1, 3], [0, 1, 3])]
@@ -182,16 +186,90 @@ def _record(
         stamp_ns=episode.stamp_ns,
         offset=np.array(offset, np.int64),
         points=points.finish(),
-        hit=hits.finish(),
+        hit=made["hit"],
         T_base_sensor=T_base_sensor[None],
         sensor=np.zeros(T, np.int32),
         T_odom_base=T_odom_base,
         source=episode.source([SensorNotes(sensor.name)]),
-        beam_time=times.finish() if sensor.takes_time else None,
+        beam_time=made["time"] if sensor.takes_time else None,
         scratch=scratch,
     )
     sizes = np.column_stack([episode.motion.sizes, world.movers.tall])
     more = {"mover_sizes": np.where(np.isnan(sizes), np.array(None), sizes).tolist()}
-    thing = things.finish() if episode.has_standing_things else None
-    truth = episode.truth(statics.finish(), movers.finish(), T_world_base, more, thing=thing)
-    return recording, truth
+    thing = made["thing"] if has_things else None
+    return recording, episode.truth(made["static"], made["mover"], T_world_base, more, thing=thing)
+
+
+def write_simulation(
+    simulation: Simulation,
+    path: str | Path,
+    *,
+    format: Literal["stillmap", "carmen"] = "stillmap",
+    overwrite: bool = False,
+) -> None:
+    """Write recording and truth into one folder that appears complete or not at all.
+
+    Args:
+        simulation: what `simulate` returned.
+        path: the folder.
+        format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`.
+        overwrite: replace an earlier simulation.
+
+    Raises:
+        InputError: the folder holds something already or cannot be written to, or the format
+            cannot say what the laser measures.
+    """
+    with atomic_folder(Path(path), MARK, overwrite) as work:
+        if format == "carmen":
+            write_log(simulation.recording, work / CARMEN_LOG)
+            truth.write_truth(simulation.truth, simulation.recording.stamp_ns, work)
+        else:
+            write_folder(simulation, work)
+
+
+def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write what two lasers recorded, each with its truth, into one folder.
+
+    `horizontal` and `tilting` are folders as `write_simulation` makes them; `joint_angle.npy` (T,)
+    beside them has the joint's angle in rad at each stamp.
+
+    Raises:
+        InputError: the folder holds something already or cannot be written to.
+    """
+    with atomic_folder(Path(path), RIG_MARK, overwrite) as work:
+        for name, simulation in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
+            (work / name).mkdir()
+            write_folder(simulation, work / name)
+        write_npy(work / "joint_angle.npy", rig.joint_angle)
+
+
+def count_beams(simulation: Simulation) -> dict[str, int]:
+    """Numbers of scans, beams, hits, and hits on movers."""
+    return {
+        "scans": simulation.recording.n_scans,
+        "beams": simulation.recording.n_beams,
+        "hits": int(np.count_nonzero(simulation.recording.hit)),
+        "dynamic": int(np.count_nonzero(simulation.truth.mover >= 0)),
+    }
+
+
+def write_folder(simulation: Simulation, work: Path) -> None:
+    """A recording folder with its truth, and pictures with theirs, into an existing folder."""
+    recording, photographs = simulation.recording, simulation.photographs
+    truth.write_truth(simulation.truth, recording.stamp_ns, work)
+    if photographs is not None:
+        truth.write_image_truth(photographs.truth(), work / truth.FOLDER)
+        images = replace(photographs.images, load=_write_on_read(photographs, work / truth.FOLDER))
+        recording = replace(recording, images=images)
+    stillmap_folder.write_into(recording, work)
+
+
+def _write_on_read(photographs: CameraSimulator, folder: Path) -> Callable[[int], Color]:
+    """Renders an image and writes its truth, so that each is rendered once only."""
+
+    def load(image: int) -> Color:
+        seen = photographs.render(image)
+        truth.write_seen(folder, image, seen.mask, seen.distance)
+        return seen.color
+
+    return load

@@ -1,4 +1,4 @@
-"""The truth of a simulation: read by the scores, never by the mapping."""
+"""The truth of a simulation and its files: read by the scores, never by the mapping."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_folder import open_npy, read_npz
+from stillmap.core.array_folder import open_npy, read_npz, write_arrays
+from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
-from stillmap.core.json import read_json
-from stillmap.io.images import read_image
+from stillmap.core.json import read_json, write_json
+from stillmap.io.images import read_image, write_png
+from stillmap.io.trajectory import write_tum
 from stillmap.sim.geometry import Faces, Float, Ground, MovingSurfaces, Solids, StaticSurfaces
 
 FOLDER = "truth"
@@ -20,6 +22,7 @@ ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
 OPTIONAL = ("lasting", "T_base_sensor", "thing")
 IMAGES, CAMERAS = "images", "T_world_camera.npy"
 STANDING, MOVING, POSE = "standing.npz", "moving.npz", "moving_pose.npy"
+_MAX_DISTANCE = 65.535  # m, of a 16-bit image in millimetres
 _MAX_SCENE, _MAX_ARRAY = 64 << 20, 1 << 31  # bytes of the file, of an unpacked array
 
 
@@ -113,10 +116,10 @@ def load_image_truth(path: str | Path) -> ImageTruth:
     standing = StaticSurfaces(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
 
     def mask(image: int) -> NDArray[np.uint16]:
-        return read_image(image_files(folder, image)[0])
+        return read_image(_image_files(folder, image)[0])
 
     def distance(image: int) -> NDArray[np.float32]:
-        metres = read_image(image_files(folder, image)[1]).astype(np.float32) / 1e3
+        metres = read_image(_image_files(folder, image)[1]).astype(np.float32) / 1e3
         return np.where(metres > 0.0, metres, np.float32(np.inf))
 
     return ImageTruth(seed, standing, moving, T_world_camera, mask, distance)
@@ -137,6 +140,46 @@ def _find_folder(path: str | Path, mark: str, what: str, how: str) -> Path:
     return folder
 
 
-def image_files(folder: Path, image: int) -> tuple[Path, Path]:
+def _image_files(folder: Path, image: int) -> tuple[Path, Path]:
     """Mask and distances of an image, in a truth folder."""
     return folder / IMAGES / f"{image:06d}.png", folder / IMAGES / f"{image:06d}-distance.png"
+
+
+def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
+    """Write the truth about the beams of a recording into its folder."""
+    inside = folder / FOLDER
+    inside.mkdir()
+    arrays = {name: getattr(truth, name) for name in (*ARRAYS, *OPTIONAL)}
+    if not len(truth.lasting):
+        del arrays["lasting"]
+    write_arrays(inside, arrays)
+    write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
+    write_json(inside / SCENE, truth.scene)
+
+
+def write_image_truth(surfaces: ImageTruth, folder: Path) -> None:
+    """Write the truth about images, but for masks and distances; see `write_seen`."""
+    (folder / IMAGES).mkdir()
+    faces, solids, ground, ceiling = surfaces.standing
+    standing = {
+        f"{name}_{key}": np.asarray(value)
+        for name, part in (("faces", faces), ("solids", solids), ("ground", ground))
+        for key, value in part._asdict().items()
+    }
+    standing["ceiling"] = np.array(np.nan if ceiling is None else ceiling)
+    standing["colour_seed"] = np.array(surfaces.colour_seed)
+    write_npz(folder / STANDING, standing)
+    moving = surfaces.moving.solids._asdict()
+    write_npy(folder / POSE, moving.pop("pose"))
+    write_npz(folder / MOVING, {"stamp_ns": surfaces.moving.stamp_ns, **moving})
+    write_npy(folder / CAMERAS, surfaces.T_world_camera)
+
+
+def write_seen(
+    folder: Path, image: int, mask: NDArray[np.uint16], distance: NDArray[np.float32]
+) -> None:
+    """Write mask and distances of an image into a truth folder."""
+    paths = _image_files(folder, image)
+    write_png(mask, paths[0])
+    near = np.where(distance < _MAX_DISTANCE, distance, 0.0)
+    write_png(np.rint(1e3 * near).astype(np.uint16), paths[1])

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
-from stillmap.sim.scene import Door, Point, Segment
+from stillmap.sim.scene import Point, Segment
 
 Side = Literal["north", "south", "east", "west"]
 
@@ -60,14 +60,6 @@ def locate(start: Point, side: Side, along: float, out: float = 0.0) -> Point:
     return (start[0] + along * ux + out * ox, start[1] + along * uy + out * oy)
 
 
-def box_along(
-    start: Point, side: Side, at: Point, width: float, depth: float, angle: float = 0.0
-) -> list[Segment]:
-    """A box `width` metres along a wall, centred at `at`, metres along and behind that wall."""
-    size = (width, depth) if side in ("north", "south") else (depth, width)
-    return box(*locate(start, side, *at), *size, angle)
-
-
 def wall(
     start: Point, length: float, side: Side, openings: Iterable[Sequence[Any]] = ()
 ) -> list[Segment]:
@@ -88,60 +80,10 @@ def wall(
     return [s for s in segments if s[:2] != s[2:]]
 
 
-def room(
-    start: Point, side: Side, along: tuple[float, float], depth: float, door: Sequence[Any]
-) -> list[Segment]:
-    """A room behind the open `door` of a wall that begins at `start`.
-
-    Args:
-        start: where the wall begins, as for `wall`.
-        side: the side of the wall on which the room lies.
-        along: where the room begins and ends, metres along the wall.
-        depth: metres, inside, measured from the back of the doorway.
-        door: the doorway, an opening of that same wall.
-    """
-    opening = Opening(*door)
-    near, far = opening.depth, opening.depth + depth
-    corners = [
-        (opening.start, near),
-        (along[0], near),
-        (along[0], far),
-        (along[1], far),
-        (along[1], near),
-        (opening.start + opening.width, near),
-    ]
-    return polyline([locate(start, side, *corner) for corner in corners])
-
-
-def leaf(
-    start: Point, side: Side, opening: Opening, swing: float, hinged_at_end: bool = False
-) -> Door:
-    """A door in the doorway `opening` of a wall that begins at `start`; it opens outwards.
-
-    Args:
-        start: where the wall begins, as for `wall`.
-        side: the side of the wall on which the room lies.
-        opening: the doorway, an opening of that same wall.
-        swing: rad, how far it opens.
-        hinged_at_end: its hinge is where the opening ends, seen along the wall.
-    """
-    (ux, uy), (ox, oy) = _AXES[side]
-    gap = 0.02
-    at = opening.start + (opening.width - gap if hinged_at_end else gap)
-    hinge = locate(start, side, at, opening.depth)
-    if hinged_at_end:
-        ux, uy = -ux, -uy
-    closed = math.atan2(uy, ux)
-    turn = swing if ux * oy - uy * ox > 0 else -swing
-    return Door(hinge, opening.width - 2 * gap, closed, closed + turn)
-
-
 # how the data files of worlds call them
 PIECES: dict[str, Callable[..., list[Segment]]] = {
     "line": lambda *points: polyline(points),
     "box": box,
-    "box_along": box_along,
     "pillar": pillar,
     "wall": wall,
-    "room": room,
 }

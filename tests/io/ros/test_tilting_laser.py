@@ -15,9 +15,10 @@ from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.reader import read_parts
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import interpret
-from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
+from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.sim.laser import compute_beam_angles
 from stillmap.sim.lidar import compute_joint_angle
+from stillmap.sim.options import RigOptions
 
 NOD = {"tilts": True, "period": 2.0}
 JOINT_NS = 5_000_000  # from one transform of the joint to the next; turns happen at some of them

@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 
 from stillmap.cli.main import main
-from stillmap.sim import (
-    CrowdOptions,
-    RobotOptions,
-    Scene,
-    scene_by_name,
-    simulate,
-    simulate_rig,
-    write_rig,
-    write_simulation,
-)
-from stillmap.sim.options import CameraOptions, LidarOptions
+from stillmap.sim import Scene, scene_by_name, simulate, simulate_rig, write_rig, write_simulation
+from stillmap.sim.options import CameraOptions, CrowdOptions, LidarOptions, RobotOptions
 from stillmap.sim.walls import box
 
 _HERE = Path(__file__).resolve()

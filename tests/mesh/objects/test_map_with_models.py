@@ -12,7 +12,7 @@ from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.camera import project
 from stillmap.io import stillmap_folder
-from stillmap.sim import load_image_truth
+from stillmap.sim.truth import load_image_truth
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 

@@ -1,13 +1,13 @@
 """The worlds by name: data files beside this module. Metres; x to the east, y to the north.
 
-A file draws its world from pieces of `walls.py`, one row each: `["box", x, y, width, height]`.
-`extends` names a world of which it says only what differs; `lifted` are objects made of walls of
-that world.
+A file draws walls, kerbs and the faces of things from pieces of `walls.py`, one row each:
+`["box", x, y, width, height]`. `extends` names a world of which it says only what differs;
+`cleared` are rectangles x, y, width, height about a center, without walls of that world.
 """
 
 import dataclasses
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import resources
 from typing import Any, get_type_hints
@@ -16,8 +16,8 @@ from pydantic import TypeAdapter
 
 from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
-from stillmap.sim.scene import Scene, Segment, Stay, Thing
-from stillmap.sim.walls import PIECES, Opening, leaf
+from stillmap.sim.scene import Scene, Segment
+from stillmap.sim.walls import PIECES
 
 _EMPTY = "-empty"
 _TYPES = get_type_hints(Scene)
@@ -28,63 +28,30 @@ _WORLDS = sorted(f.name[:-5] for f in _FOLDER.iterdir() if f.name.endswith(".tom
 def load_world(name: str) -> Scene:
     """The world of a data file."""
     tree = tomllib.loads((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
-    base = tree.pop("extends", None)
+    base, cleared = tree.pop("extends", None), tree.pop("cleared", [])
     sections = {key: tree.pop(key) for key in list(tree) if isinstance(tree[key], dict)}
-    lifted, brought = tree.pop("lifted", []), map(_read_thing, tree.pop("things", []))
-    values = {"name": name, **{key: _read(key, rows) for key, rows in tree.items()}}
+    for part, key in [
+        (tree, "walls"),
+        (tree, "kerbs"),
+        *((t, "faces") for t in tree.get("things", [])),
+    ]:
+        if key in part:
+            part[key] = [
+                segment for kind, *values in part[key] for segment in PIECES[kind](*values)
+            ]
+    values = {key: TypeAdapter(_TYPES[key]).validate_python(rows) for key, rows in tree.items()}
+    values["name"] = name
     scene = Scene(**values) if base is None else dataclasses.replace(load_world(base), **values)
-    walls, things = scene.walls, []
-    for moved in lifted:
-        thing, walls = _lift(walls, **moved)
-        things.append(thing)
-    scene = dataclasses.replace(scene, walls=walls, things=(*things, *brought))
+    walls = (wall for wall in scene.walls if not any(_is_within(wall, *area) for area in cleared))
+    scene = dataclasses.replace(scene, walls=tuple(walls))
     for section in sections.values():
         section.update({key: None for key, value in section.items() if value == "unset"})
     return override(scene, sections)
 
 
-def _draw(rows: list[list[Any]]) -> tuple[Segment, ...]:
-    return tuple(segment for kind, *values in rows for segment in PIECES[kind](*values))
-
-
-def _read(key: str, rows: Any) -> Any:
-    """The value of a field of a scene."""
-    if key in ("walls", "kerbs"):
-        return _draw(rows)
-    if key == "leaves":
-        doors = ((start, side, Opening(*door), *swing) for start, side, door, *swing in rows)
-        return tuple(leaf(*door) for door in doors)
-    return TypeAdapter(_TYPES[key]).validate_python(rows)
-
-
-def _read_thing(row: dict[str, Any]) -> Thing:
-    return Thing(_draw(row["faces"]), tuple(Stay(**stay) for stay in row["stays"]))
-
-
-def _lift(
-    walls: Sequence[Segment],
-    at: Sequence[float],
-    size: Sequence[float],
-    until: float,
-    then: Sequence[dict[str, Any]] = (),
-) -> tuple[Thing, tuple[Segment, ...]]:
-    """The walls within a rectangle as an object, and all others.
-
-    Args:
-        walls: of the world that it stands in for good.
-        at, size: metres, center and size of the rectangle.
-        until: seconds, when it is taken away from there.
-        then: stays afterwards.
-    """
-    (x, y), (width, height) = at, size
-
-    def is_within(wall: Segment) -> bool:
-        ends = (wall[:2], wall[2:])
-        return all(abs(u - x) < width / 2 and abs(v - y) < height / 2 for u, v in ends)
-
-    about = tuple((a - x, b - y, c - x, d - y) for a, b, c, d in filter(is_within, walls))
-    stays = (Stay(x, y, until=until), *(Stay(**stay) for stay in then))
-    return Thing(about, stays), tuple(wall for wall in walls if not is_within(wall))
+def _is_within(wall: Segment, x: float, y: float, width: float, height: float) -> bool:
+    ends = (wall[:2], wall[2:])
+    return all(abs(u - x) < width / 2 and abs(v - y) < height / 2 for u, v in ends)
 
 
 def _empty(world: Callable[[], Scene]) -> Scene:
