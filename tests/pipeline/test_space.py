@@ -17,8 +17,7 @@ from stillmap.cli.main import main
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.results.report.page import render_report
-from stillmap.sim import scene_by_name, simulate
-from stillmap.sim.writer import write_simulation
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 
 @pytest.fixture(scope="module")
