@@ -9,7 +9,7 @@ from synthetic_histories import EVERY_SECOND, S, course, recording, seconds, tog
 
 from stillmap.em.change_hmm import select_changed_cells
 from stillmap.mapping import Change, detect_changes_3d
-from stillmap.mapping.change_detection import measure_dwell_times
+from stillmap.mapping.changed_objects import measure_dwell_times
 
 VOXEL = 0.15
 CAR, GROUND = (20, 8, 9), (40, 20, 2)

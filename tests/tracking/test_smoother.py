@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
-from stillmap.tracking.vehicle_filter import smooth_track
+from stillmap.tracking.mover_path import smooth_track
 
 
 @pytest.mark.parametrize("n", [5, 6, 40, 300])

@@ -9,7 +9,7 @@ from synthetic_tracks import watched
 
 from stillmap.tracking.association import assign_tracks
 from stillmap.tracking.clustering import DynamicPoints
-from stillmap.tracking.vehicle_filter import smooth_track
+from stillmap.tracking.mover_path import smooth_track
 
 MAX_GAP = 2.0
 

@@ -19,10 +19,8 @@ from stillmap.em.estimator import (
 )
 from stillmap.em.final_labels import final_e_step
 from stillmap.em.ground import estimate_ground
-from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import (
     GridWindow,
-    ObservedCells,
     OccupancyMap,
     find_hits_beyond,
     make_occupancy_map,
@@ -36,7 +34,6 @@ from stillmap.em.types import (
     Grid,
     GroundMap,
     Likelihood,
-    NoReturnModel,
 )
 
 __all__ = [
@@ -53,8 +50,6 @@ __all__ = [
     "GroundMap",
     "Likelihood",
     "MapState",
-    "NoReturnModel",
-    "ObservedCells",
     "OccupancyMap",
     "add_recording",
     "add_trusted_beams",
@@ -74,6 +69,5 @@ __all__ = [
     "needs_counts",
     "recount_as_static",
     "score_held_out_scans",
-    "time_bin_index",
     "touched_share",
 ]

@@ -1,7 +1,10 @@
-"""Changed places: cells near each other that changed at the same time."""
+"""Changed places: cells near each other that changed at the same time.
+
+Nothing arrives or leaves in plain view by itself: there a mover must explain the change.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -10,10 +13,10 @@ from stillmap.core.array_types import Bool, Cells, Float, Index, Int32, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
-from stillmap.em import CellHistories, ChangedCells, time_bin_index
+from stillmap.em import CellHistories, ChangedCells
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
+from stillmap.em.observations import time_bin_index
 from stillmap.mapping.doors import Door
-from stillmap.mapping.mover_points import MoverPoints, is_explained
 
 Kind = Literal["came", "left", "comes and goes", "door"]
 
@@ -22,6 +25,64 @@ _LINK_DISTANCE = 0.5  # m within which changed cells form one place
 _MAX_TIME_GAP = 2.0  # s between the changes of cells of one place
 _MIN_CELLS = 4  # of a listed change
 _NOISE = 2.0  # cells by which noise of poses and ranges moves surfaces
+
+_UNSEEN = 2.0  # s between two observations, during which something may move unseen
+_REACH = 1.0  # m between a mover and what it moves: half of a car that parks, an arm
+_SLACK = 2.0  # s between the mover's end points and the change
+_SQUARE = 0.25  # m, see MoverPoints.thin
+
+
+class MoverPoints(NamedTuple):
+    """N end points on movers.
+
+    Attributes:
+        xy: (N, 2) metres in the map frame.
+        stamp_ns: (N,) stamps of their scans.
+    """
+
+    xy: Float
+    stamp_ns: Int64
+
+    @classmethod
+    def none(cls) -> "MoverPoints":
+        """Without a point."""
+        return cls(np.zeros((0, 2)), np.zeros(0, np.int64))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["MoverPoints"]) -> "MoverPoints":
+        """All points of several sets."""
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def thin(self) -> "MoverPoints":
+        """One point per square of 25 cm and second."""
+        squares = np.floor(self.xy / _SQUARE).astype(np.int64)
+        cells = np.column_stack([squares, self.stamp_ns // 1_000_000_000])
+        some = np.unique(cells, axis=0, return_index=True)[1]
+        return MoverPoints(self.xy[some], self.stamp_ns[some])
+
+
+def is_explained(xy: Float, before_ns: Int64, after_ns: Int64, movers: MoverPoints) -> Bool:
+    """(K,) whether a change may be one: it was not in view then, or a mover was there.
+
+    Args:
+        xy: (K, 2) metres, places.
+        before_ns, after_ns: (K,) the observations before and after the change.
+        movers: end points on movers.
+    """
+    unseen = after_ns - before_ns > _UNSEEN * 1e9
+    if unseen.all() or not len(movers.xy):
+        return np.asarray(unseen)
+    from scipy.spatial import cKDTree  # slow to load
+
+    origin = int(movers.stamp_ns.min())
+    seconds = 1e-9 * (movers.stamp_ns - origin)
+    scale = 0.5 * _UNSEEN + _SLACK  # from the middle between the observations
+    tree = cKDTree(np.column_stack([movers.xy / _REACH, seconds / scale]))
+    middle = 1e-9 * (before_ns - origin + (after_ns - before_ns) // 2)
+    # all within 1 of each other in place and time
+    places = np.column_stack([xy / _REACH, middle / scale])
+    distance, _ = tree.query(places, p=np.inf, distance_upper_bound=1.0)
+    return np.asarray(unseen | np.isfinite(distance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,94 +348,3 @@ def _make_change(
     x, y, *z = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
     size = tuple((high - low).tolist())
     return Change(kind, x, y, size, cells, resolution, before, stamp, last, times, *z)
-
-
-_MIN_STAY = 12.0  # s: a shorter stay is a wait, a shorter absence an occlusion
-_MIN_HEIGHT = 0.4  # m: anything lower is ground observed along other beams
-_MIN_AREA = 0.7  # m2 of visible surface
-_DWELL_QUANTILE = 0.25  # of the observed times of an object's voxels
-
-
-def detect_changes_3d(
-    changed: ChangedCells, recording: Recording, poses: Float, resolution: float, time_bin: float
-) -> list[Change]:
-    """Changed places that are objects at rest: high, large and present for long enough.
-
-    `cells` of each are those of the plane (K, 2), `size` has three lengths, and `z` is known.
-
-    Args:
-        changed: candidate voxels.
-        recording: 3D, deskewed.
-        poses: (T, 4, 4) T_map_base.
-        resolution: m, edge of a voxel.
-        time_bin: s, width of a time bin.
-    """
-    first, last = recording.stamp_ns[[0, -1]].tolist()
-    lasting = _select_lasting(changed, _MIN_STAY / time_bin, 1e-9 * (last - first) / time_bin)
-    unchanged = np.zeros((0, 3), np.int64)  # large objects need no test against noise
-    objects = [
-        one
-        for one in group_changes(lasting, unchanged, recording, resolution, time_bin)
-        if one.size[2] >= _MIN_HEIGHT
-        and len(one.cells) * resolution**2 >= _MIN_AREA
-        and 1e-9 * min(one.stamp_ns - first, last - one.before_ns) >= _MIN_STAY
-    ]
-    dwell_times = measure_dwell_times(objects, recording, poses, resolution)
-    return [
-        replace(one, cells=np.unique(one.cells[:, :2], axis=0))
-        for one, seconds in zip(objects, dwell_times, strict=True)
-        if seconds >= _MIN_STAY
-    ]
-
-
-def _select_lasting(changed: ChangedCells, min_bins: float, bins: float) -> ChangedCells:
-    """The cells that kept each state for at least `min_bins` of all `bins` time bins."""
-    before, after = changed.change_bins[..., 0], changed.change_bins[..., 1]
-    once = (after[:, 1] >= min_bins) & (bins - before[:, 1] >= min_bins)
-    twice = before[:, 1] - after[:, 0] >= min_bins
-    return changed.select(np.where(changed.n_changes == 1, once, twice))
-
-
-def measure_dwell_times(
-    places: Sequence[Change], recording: Recording, poses: Float, resolution: float
-) -> list[float]:
-    """Seconds for which three quarters of each object's voxels were hit while it stood there.
-
-    A passing vehicle, or an object occluded soon after, arrives as well; but each of its voxels is
-    hit for a moment only.
-
-    Args:
-        places: changed places; `cells` are (K, 3) voxels.
-        recording: 3D, M beams, deskewed.
-        poses: (T, 4, 4) T_map_base.
-        resolution: metres, edge of a voxel.
-    """
-    if not places:
-        return []
-    # the N voxels of all places; one of several places is there several times
-    voxels = np.concatenate([one.cells for one in places])
-    place = np.repeat(np.arange(len(places)), [len(one.cells) for one in places])
-    low, high = voxels.min(axis=0), voxels.max(axis=0)
-    shape = tuple((high - low + 1).tolist())
-    key = np.ravel_multi_index(tuple((voxels - low).T), shape)
-    limits = np.iinfo(np.int64)
-    first, last = np.full(len(place), limits.max), np.full(len(place), limits.min)
-    since = np.array([one.stamp_ns if one.appeared else limits.min for one in places])[place]
-    until = np.array([limits.max if one.appeared else one.before_ns for one in places])[place]
-    T_map_sensor = recording.T_map_sensor(poses)
-    for t in recording.iter_scans(range(recording.n_scans)):
-        stamp, beams, T = int(recording.stamp_ns[t]), recording.beams_of(t), T_map_sensor[t]
-        points = recording.points[beams][recording.hit[beams]].astype(np.float64)
-        cells = np.floor((points @ T[:3, :3].T + T[:3, 3]) / resolution).astype(np.int64)
-        inside = cells[((cells >= low) & (cells <= high)).all(axis=1)] - low
-        was_hit = np.isin(key, np.ravel_multi_index(tuple(inside.T), shape))
-        was_hit &= (since <= stamp) & (stamp <= until)
-        first[was_hit] = np.minimum(first[was_hit], stamp)
-        last[was_hit] = np.maximum(last[was_hit], stamp)
-    out = []
-    for number, one in enumerate(places):
-        its = place == number
-        shown = last[its] - one.stamp_ns if one.appeared else one.before_ns - first[its]
-        seconds = 1e-9 * np.where(last[its] >= first[its], shown, 0)
-        out.append(float(np.quantile(seconds, _DWELL_QUANTILE, method="lower")))
-    return out

@@ -26,13 +26,14 @@ from stillmap.mapping.door_states import (
     observe_passages,
 )
 from stillmap.mapping.doors import Door, DoorState
-from stillmap.mapping.doorways import find_doorways
-from stillmap.mapping.lone_leaves import LoneLeaf, find_open_leaf, is_doorway_free, is_thin
-from stillmap.mapping.shut_leaves import (
+from stillmap.mapping.doorways import (
+    LoneLeaf,
     estimate_p_door,
     estimate_shut_share,
+    find_doorways,
     find_shut_leaf,
 )
+from stillmap.mapping.lone_leaves import find_open_leaf, is_doorway_free, is_thin
 
 _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
 _WATCHED = 2.0  # s between two looks within which a swing would have been seen

@@ -18,7 +18,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
 from stillmap.em.types import DYNAMIC_BELOW
-from stillmap.mapping.doorways import Doorway
+from stillmap.mapping.doorways import Doorway, LoneLeaf
 from stillmap.mapping.resting_leaf import SurfaceField
 
 _ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
@@ -42,26 +42,6 @@ _MIN_BEHIND = 0.3  # the same of the other side, which walls hide from the doorw
 _ROUGHNESS, _MORE_ROUGHNESS = 0.75, 0.35
 _BESIDE = np.array([3.0, 4.0, 5.0])  # cells from the leaf, of a row that beams pass beside it
 _MAX_HIT_SHARE, _MIN_LENGTHS = 0.25, 0.5  # of the beams in a cell that passed; cell lengths
-
-
-class LoneLeaf(NamedTuple):
-    """A leaf that was in one position, open or shut.
-
-    Attributes:
-        hinge: (2,) cells.
-        length: cells.
-        shut, leaf: (2,) unit directions from the hinge to the other end of the doorway, and along
-            the leaf.
-        cells: (K, 2) of it, without those at the edge of the wall.
-        roughness: cells, standard deviation of its surface from a line; 0 of a shut one.
-    """
-
-    hinge: Float
-    length: float
-    shut: Float
-    leaf: Float
-    cells: Cells
-    roughness: float = 0.0
 
 
 def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:

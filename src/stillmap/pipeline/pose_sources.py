@@ -20,7 +20,7 @@ from stillmap.core.recording import Recording
 from stillmap.pipeline.em_loop import label_poses
 from stillmap.pipeline.estimate import EmState, Iteration, IterationRecord
 from stillmap.pipeline.options import Options
-from stillmap.slam.odometry_agreement import replace_stretches
+from stillmap.slam.odometry_faults import replace_stretches
 
 Float = NDArray[np.float64]
 

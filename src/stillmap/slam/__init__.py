@@ -1,7 +1,7 @@
 """The M-step: poses, loops and map given P(static) of every beam, which is only read."""
 
 from stillmap.slam.deskew import deskew_recording
-from stillmap.slam.m_step import StepProgress, m_step
+from stillmap.slam.m_step import m_step
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import PoseGraph
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN
@@ -15,7 +15,6 @@ __all__ = [
     "MStepResult",
     "PoseGraph",
     "SlamOptions",
-    "StepProgress",
     "deskew_recording",
     "m_step",
 ]

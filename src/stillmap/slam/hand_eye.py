@@ -12,6 +12,7 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float
+from stillmap.core.recording import Recording
 from stillmap.slam.motion_model import compute_odometry_steps
 from stillmap.slam.scan_motion import MotionWindows
 from stillmap.slam.turn_rates import sum_by_segment
@@ -38,6 +39,26 @@ _DIFFERENCE = 1e-4  # m, rad or 1, of numeric derivatives
 def laser_names(laser: int) -> tuple[str, str, str]:
     """Names of the parameters of a laser: yaw in rad, position in m."""
     return f"theta{laser}", f"x{laser}", f"y{laser}"
+
+
+def kind(name: str) -> str:
+    """The name of a parameter without the number of its laser."""
+    return name.rstrip("0123456789")
+
+
+def difference(name: str, value: float, nominal: float) -> float:
+    """Of a parameter of this name; of angles between -pi and pi."""
+    d = value - nominal
+    return float(se2.wrap(d)) if name.startswith("theta") else d
+
+
+def nominal_values(recording: Recording) -> Values:
+    """All parameters as recorded."""
+    values: Values = {SCALE: 1.0, GAIN: 1.0}
+    for k, pose in enumerate(se2.parameters(recording.T_base_sensor)):
+        x, y, theta = pose.tolist()
+        values.update(zip(laser_names(k), (theta, x, y), strict=True))
+    return values
 
 
 def correct_odometry(
@@ -206,7 +227,7 @@ class HandEye:
         """
         values, nu = dict(start), _DEGREES_OF_FREEDOM
         chosen = np.ones(len(self.segment), np.bool_) if use is None else use
-        prior = np.array([_PRIOR_STD[name.rstrip("0123456789")] ** -2 for name in free])
+        prior = np.array([_PRIOR_STD[kind(name)] ** -2 for name in free])
         for _ in range(_ITERATIONS if len(free) else 1):
             r = self.residuals(values)
             squares = np.einsum("wi,wij,wj->w", r, self.information, r)
@@ -217,7 +238,7 @@ class HandEye:
             J = np.stack([self._derivative(values, name) for name in free], axis=-1)
             WJ = weights[:, None, None] * (self.information @ J)
             A = np.einsum("wip,wiq->pq", J, WJ) + np.diag(prior)
-            off = np.array([self._from_nominal(values, name) for name in free])
+            off = np.array([difference(name, values[name], self.nominal[name]) for name in free])
             step = np.linalg.solve(A, -np.einsum("wip,wi->p", WJ, r) - prior * off)
             for name, change in zip(free, step, strict=True):
                 values[name] += float(np.clip(change, -_MAX_STEP, _MAX_STEP))
@@ -235,10 +256,6 @@ class HandEye:
             self.residuals({**values, name: values[name] + d}) for d in (_DIFFERENCE, -_DIFFERENCE)
         )
         return (above - below) / (2.0 * _DIFFERENCE)
-
-    def _from_nominal(self, values: Values, name: str) -> float:
-        difference = values[name] - self.nominal[name]
-        return float(se2.wrap(difference)) if name.startswith("theta") else difference
 
 
 def _odometry_noise(motion: Float) -> Float:

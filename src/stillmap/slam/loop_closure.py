@@ -10,7 +10,6 @@ from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import (
-    bare_stretches,
     local_map,
     loop_candidates,
     loop_verification,
@@ -21,7 +20,7 @@ from stillmap.slam.heading_alignment import align_headings
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.slam.relocalization import Relocalization
-from stillmap.slam.types import LoopClosure, LoopContext, MStepResult, ScanProgress
+from stillmap.slam.types import BareStretch, LoopClosure, LoopContext, MStepResult, ScanProgress
 
 KEYFRAME_DISTANCE, SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
 _MAX_CHI2 = 16.0  # 3 degrees of freedom; above it the graph rejects a loop
@@ -66,7 +65,7 @@ def close_loops(
             breaks=relocalized.breaks,
             unconnected=relocalized.unconnected,
             ambiguous=relocalized.ambiguous,
-            bare_stretches=bare_stretches.without_loops(odometry.diagnostics.bare_stretches, found),
+            bare_stretches=_without_loops(odometry.diagnostics.bare_stretches, found),
         ),
     )
 
@@ -92,6 +91,12 @@ def _relocalize(
         np.zeros((len(poses), 3, 3)) if odometry.drift is None else odometry.drift,
     )
     return relocalization.relocalize_segments(context, breaks)
+
+
+def _without_loops(stretches: list[BareStretch], loops: list[LoopClosure]) -> list[BareStretch]:
+    """The stretches that no accepted loop spans: one that does measures their length."""
+    spans = [(loop.earlier, loop.later) for loop in loops if not loop.rejected]
+    return [s for s in stretches if not any(i <= s.first and s.last <= j for i, j in spans)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,20 +26,6 @@ from stillmap.slam.types import MStepResult, ScanProgress
 _SCANS_PER_CALL = 200  # of the kernel; interrupts are noticed in between
 
 
-class _MotionSteps(NamedTuple):
-    """The motion from each scan to the next.
-
-    Attributes:
-        increments: (T, 3, 3).
-        std: (T, 2) standard deviations in m and rad.
-        known: (T,) False across breaks, and after the last scan.
-    """
-
-    increments: Float
-    std: Float
-    known: Bool
-
-
 def refine_poses(
     recording: Recording,
     e: Float32,
@@ -60,7 +45,7 @@ def refine_poses(
     poses = initial.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    steps = _motion_steps(recording, poses, options, initial.diagnostics.breaks)
+    increments, std, known = _motion_steps(recording, poses, options, initial.diagnostics.breaks)
     grid = _core.OccupancyGrid2D(options.resolution, scan_hits.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
@@ -81,9 +66,9 @@ def refine_poses(
             recording.T_base_sensor[recording.sensor[scans]],
             is_in_map[scans],
             poses[before_to_after],
-            steps.increments[to_each_and_beyond],
-            steps.std[to_each_and_beyond],
-            steps.known[to_each_and_beyond],
+            increments[to_each_and_beyond],
+            std[to_each_and_beyond],
+            known[to_each_and_beyond],
             np.array(motion_model.MIN_INCREMENT_STD),
             **scan_matching.refinement_options(grid),
         )
@@ -93,10 +78,14 @@ def refine_poses(
 
 def _motion_steps(
     recording: Recording, poses: Float, options: SlamOptions, breaks: list[int]
-) -> _MotionSteps:
-    """The steps of odometry, with the noise that it has about the poses (T, 3, 3).
+) -> tuple[Float, Float, Bool]:
+    """The motion from each scan to the next by odometry, with its noise about the poses.
 
-    Those of the poses where odometry is missing or at fault.
+    By the poses (T, 3, 3) where odometry is missing or at fault.
+
+    Returns:
+        increments (T, 3, 3); their std (T, 2) in m and rad; which are known (T,), False across
+        breaks and after the last scan.
     """
     motion = se2.inverse(poses[:-1]) @ poses[1:]
     increments, std = motion, np.tile(motion_model.MIN_INCREMENT_STD, (len(motion), 1))
@@ -107,9 +96,8 @@ def _motion_steps(
         std = motion_model.increment_std(increments, options.odometry, noise)
     known = np.ones(len(poses), np.bool_)
     known[[*(t - 1 for t in breaks), -1]] = False
-    return _MotionSteps(
-        np.concatenate([increments, np.eye(3)[None]]), np.concatenate([std, np.ones((1, 2))]), known
-    )
+    padded = np.concatenate([increments, np.eye(3)[None]]), np.concatenate([std, np.ones((1, 2))])
+    return *padded, known
 
 
 StepProgress = Callable[[str, int, int], None]  # step, scans done, total; 0: not counted

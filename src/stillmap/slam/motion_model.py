@@ -27,6 +27,8 @@ _ACCELERATION, _ANGULAR_ACCELERATION = 2.0, 4.0  # m/s^2, rad/s^2 that may occur
 # odometry's information is discounted as much as that of the beams: they share their errors
 _INFLATION = 2.2
 _NOISE_RATE, _MIN_NOISE_SHARE, _MIN_GAIN, _MAX_INNOVATION = 0.05, 0.1, 0.1, 3.0
+# s after which a velocity that no scan corrected says nothing any more
+_VELOCITY_TIME = 5.0
 _MAX_UNANNOUNCED = 0.15  # m and rad, upper limit of the motion that these explain
 
 
@@ -142,6 +144,26 @@ def blind_drift(prior: MotionPrior, covariance: Float) -> Float:
     """
     out: Float = covariance @ prior.information @ covariance
     return out / _INFLATION**2 if prior.is_odometry else out
+
+
+def unmeasured_variance(prior: MotionPrior, covariance: Float, seconds: float) -> float:
+    """Variance in m^2 that a step adds to the length of the way, in its least known direction.
+
+    The variance of the step times r^2, r the share of an error that the scan leaves (1 - gain of a
+    Kalman filter). Without odometry the steps after it inherit what is left, in all
+    r / (1 - lambda r), with lambda = exp(-seconds / _VELOCITY_TIME).
+
+    Args:
+        prior: of the step.
+        covariance: (3, 3) of the posterior.
+        seconds: of the step.
+    """
+    (xx, xy), (_, yy) = covariance[:2, :2].tolist()
+    least_known = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)  # the larger eigenvalue
+    r = min(least_known / prior.translation_std**2, 1.0)
+    if not prior.is_odometry:
+        r /= 1.0 - math.exp(-max(seconds, 1e-3) / _VELOCITY_TIME) * r
+    return float((prior.translation_std * r) ** 2)
 
 
 def fit_odometry_noise(

@@ -22,9 +22,11 @@ from stillmap.slam.hand_eye import (
     SCALE,
     Fit,
     HandEye,
-    Values,
     correct_odometry,
+    difference,
+    kind,
     laser_names,
+    nominal_values,
 )
 from stillmap.slam.scan_hits import thin_scans
 from stillmap.slam.scan_motion import MotionWindows, measure_motion, select_segments
@@ -126,18 +128,8 @@ def _is_suspicious(found: Calibration) -> bool:
 
 def _excess(name: str, one: Parameter) -> float:
     """Difference over the least one that is applied; 0 within two standard deviations."""
-    difference = _difference(name, one.value, one.nominal)
-    return abs(difference) / _MIN_DIFFERENCE[name] if abs(difference) > 2.0 * one.std else 0.0
-
-
-def _kind(name: str) -> str:
-    """The name of a parameter without the number of its laser."""
-    return name.rstrip("0123456789")
-
-
-def _difference(name: str, value: float, nominal: float) -> float:
-    d = value - nominal
-    return float(se2.wrap(d)) if name.startswith("theta") else d
+    off = abs(difference(name, one.value, one.nominal))
+    return off / _MIN_DIFFERENCE[name] if off > 2.0 * one.std else 0.0
 
 
 class _Calibrator:
@@ -161,10 +153,7 @@ class _Calibrator:
             measure_motion(centred, e, select_segments(recording, k, windows), resolution)
             for k in range(lasers)
         ]
-        self.nominal: Values = {SCALE: 1.0, GAIN: 1.0}
-        for k, pose in enumerate(se2.parameters(recording.T_base_sensor)):
-            x, y, theta = pose.tolist()
-            self.nominal.update(zip(laser_names(k), (theta, x, y), strict=True))
+        self.nominal = nominal_values(recording)
         self.count = sum(len(one.first) for one in self.windows)
 
     def calibrate(self) -> Calibration:
@@ -192,13 +181,13 @@ class _Calibrator:
         if latency is not None:
             odometry[LATENCY] = latency
         lasers = [
-            {_kind(name): parameters[name] for name in self._free_names(k)}
+            {kind(name): parameters[name] for name in self._free_names(k)}
             for k in range(len(self.windows))
         ]
         return Calibration(lasers, upside_down, odometry, self.count)
 
     def _free_names(self, laser: int) -> list[str]:
-        return [name for name in laser_names(laser) if _kind(name) not in self.given[laser]]
+        return [name for name in laser_names(laser) if kind(name) not in self.given[laser]]
 
     def _latency(self) -> Parameter | None:
         """By the laser that shows it best; None where none does."""
@@ -235,7 +224,7 @@ class _Calibrator:
         nominal = {SCALE: 1.0, GAIN: 1.0}
         for name, of_laser in zip(laser_names(0), laser_names(k), strict=True):
             nominal[name] = self.nominal[of_laser]
-        free = [name for name in laser_names(0) if _kind(name) not in self.given[k]]
+        free = [name for name in laser_names(0) if kind(name) not in self.given[k]]
         for mirrored in (False, True):
             problem = HandEye([one], [mirrored], T, nominal)
             fit = problem.fit_globally([*free, SCALE, GAIN])
@@ -255,11 +244,11 @@ class _Calibrator:
         out = []
         for name in names:
             pair = [name]
-            if _kind(name) in POSITION:  # one vector
+            if kind(name) in POSITION:  # one vector
                 pair = [n for n in (f"x{name[1:]}", f"y{name[1:]}") if n in names]
-            d = np.array([_difference(n, fit.values[n], self.nominal[n]) for n in pair])
+            d = np.array([difference(n, fit.values[n], self.nominal[n]) for n in pair])
             std = np.array([fit.std[n] for n in pair])
-            least = _MIN_DIFFERENCE[_kind(name)]
+            least = _MIN_DIFFERENCE[kind(name)]
             if (
                 float(np.linalg.norm(d)) > least > float(std.max())
                 and float(np.linalg.norm(d / std)) > _STDS
@@ -272,7 +261,7 @@ class _Calibrator:
         for name, (low, high) in _LIMITS.items():
             if not low < fit.values[name] < high:
                 return False
-        if any(abs(fit.values[n]) > _MAX_POSITION for n in kept if _kind(n) in POSITION):
+        if any(abs(fit.values[n]) > _MAX_POSITION for n in kept if kind(n) in POSITION):
             return False
         nominal, gain = problem.fit(self.nominal, []), np.zeros(int(problem.segment.max()) + 1)
         for side in (0, 1):
@@ -305,10 +294,7 @@ def refine_positions(recording: Recording, poses: Float, found: Calibration) -> 
         poses: (T, 3, 3) T_map_base of the recording.
         found: its calibration; other parameters stay as they are.
     """
-    nominal: Values = {SCALE: 1.0, GAIN: 1.0}
-    for k, pose in enumerate(se2.parameters(recording.T_base_sensor)):
-        x, y, theta = pose.tolist()
-        nominal.update(zip(laser_names(k), (theta, x, y), strict=True))
+    nominal = nominal_values(recording)
     free = [
         f"{name}{k}"
         for k, laser in enumerate(found.lasers)
@@ -321,17 +307,11 @@ def refine_positions(recording: Recording, poses: Float, found: Calibration) -> 
     windows = [_windows(recording, poses, k) for k in range(len(found.lasers))]
     problem = HandEye(windows, [False] * len(windows), recording.T_odom_base, nominal)
     fit = problem.fit(nominal, [*free, SCALE, GAIN])
-    lasers = [
-        {
-            name: dataclasses.replace(
-                one, value=fit.values[f"{name}{k}"], std=fit.std[f"{name}{k}"]
-            )
-            if f"{name}{k}" in free
-            else one
-            for name, one in laser.items()
-        }
-        for k, laser in enumerate(found.lasers)
-    ]
+    lasers = [dict(laser) for laser in found.lasers]
+    for fitted in free:
+        laser, name = lasers[int(fitted[1:])], fitted[0]
+        value, std = fit.values[fitted], fit.std[fitted]
+        laser[name] = dataclasses.replace(laser[name], value=value, std=std)
     return dataclasses.replace(found, lasers=lasers)
 
 

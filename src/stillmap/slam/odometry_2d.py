@@ -8,8 +8,8 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
-from stillmap.slam import bare_stretches, motion_model, relocalization
-from stillmap.slam.local_map import LocalMap
+from stillmap.slam import motion_model, relocalization
+from stillmap.slam.local_map import LocalMap, travelled_distance
 from stillmap.slam.motion_model import MotionPrior, VelocityNoise
 from stillmap.slam.odometry_faults import SlipDetector, SlipHypothesis
 from stillmap.slam.options import SlamOptions
@@ -26,12 +26,15 @@ from stillmap.slam.scan_matching import (
     match_scan,
     widen_match,
 )
-from stillmap.slam.types import Diagnostics, MStepResult, ScanProgress
+from stillmap.slam.types import BareStretch, Diagnostics, MStepResult, ScanProgress
 
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _MAX_SPEED, _MAX_TURN_RATE, _MIN_REACH = 3.0, 4.0, 0.5  # m/s, rad/s of robots; m and rad
 _SURE_GAIN = 40.0  # nats of a pose outside the prior, from which one scan is enough
 _MAX_LATE_SCANS = 4  # after which odometry is not late, but at fault
+# featureless stretches: m, from which a step is hardly measured; scans that are measured within one
+# of them; m, std of the length from which one is named
+_MIN_STEP_STD, _MAX_GAP, _MIN_STD = 0.04, 10, 0.3
 
 
 def register_scans(
@@ -117,7 +120,7 @@ class _ScanOdometry:
         is_fault = rejected is not None and is_inconsistent(rejected, match.T_map_base)
         self._record(t, match, is_fault=is_fault)
         self.drift[t] = motion_model.blind_drift(learned or prior, match.covariance)
-        self.unmeasured[t] = bare_stretches.unmeasured_variance(
+        self.unmeasured[t] = motion_model.unmeasured_variance(
             learned or prior, match.covariance, float(self.seconds_before[t])
         )
         if has_map:
@@ -236,7 +239,7 @@ class _ScanOdometry:
 
     def _is_consistent_ahead(self, t: int, match: ScanMatch, usual: float) -> bool:
         """True if the scans after t do not contradict the map if the robot goes on from a match."""
-        ahead = relocalization.look_ahead(
+        contradicts, last = relocalization.look_ahead(
             self.recording,
             self.e,
             self.local_map.grid,
@@ -245,9 +248,9 @@ class _ScanOdometry:
             match.T_map_base,
             usual,
         )
-        if not ahead.contradicts:
-            self.compared_until = ahead.last
-        return not ahead.contradicts
+        if not contradicts:
+            self.compared_until = last
+        return not contradicts
 
     def _increments(self) -> Float:
         """(T - 1, 3, 3) increments of odometry; without it, the robot stands still."""
@@ -266,9 +269,7 @@ class _ScanOdometry:
             np.flatnonzero(self.widened).tolist(),
             np.flatnonzero(self.odometry_faults).tolist(),
             self.breaks,
-            bare_stretches=bare_stretches.find_bare_stretches(
-                self.unmeasured, self.poses, self.breaks
-            ),
+            bare_stretches=_find_bare_stretches(self.unmeasured, self.poses, self.breaks),
         )
         grid = _core.OccupancyGrid2D(self.options.resolution)
         return MStepResult(
@@ -278,3 +279,27 @@ class _ScanOdometry:
 
 def _length(poses: Float) -> float:
     return float(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1).sum())
+
+
+def _find_bare_stretches(variance: Float, poses: Float, breaks: list[int]) -> list[BareStretch]:
+    """Stretches whose length the scans do not show, as along the bare walls of a corridor.
+
+    There a pose is where the motion model predicts it. Without odometry that is constant velocity,
+    which inherits the error of every pose, so that the errors of the steps add up.
+
+    Args:
+        variance: (T,) m^2 of the step to each scan.
+        poses: (T, 3, 3) T_map_base.
+        breaks: scans at which a stretch ends.
+    """
+    steps = np.flatnonzero(variance > _MIN_STEP_STD**2)
+    travelled = travelled_distance(poses)
+    ends = np.flatnonzero(np.diff(steps) > _MAX_GAP) + 1
+    stretches = []
+    for part in np.split(steps, np.union1d(ends, np.searchsorted(steps, sorted(breaks)))):
+        std = float(np.sqrt(variance[part].sum()))
+        if std >= _MIN_STD:
+            first, last = int(part[0]) - 1, int(part[-1])
+            metres = float(travelled[last] - travelled[first])
+            stretches.append(BareStretch(first, last, metres, std))
+    return stretches

@@ -80,8 +80,13 @@ def optimize_poses(
         loops: constraints that may be false.
         max_chi2: chi-square at which a loop keeps a quarter of its weight; None: no kernel.
     """
+    import gtsam  # loading it takes long
+
     graph, start = _build_problem(poses, chain)
-    _fix_first(graph, poses)
+    is_2d = poses.shape[-1] == 3
+    fixed = gtsam.noiseModel.Isotropic.Sigma(3 if is_2d else 6, _PRIOR_STD)
+    prior_factor = gtsam.PriorFactorPose2 if is_2d else gtsam.PriorFactorPose3
+    graph.add(prior_factor(0, _to_gtsam(poses[:1])[0], fixed))
 
     def solve(start: Any, weights: Float, tolerance: float) -> Any:
         weighted = graph.clone()
@@ -151,23 +156,13 @@ def squared_mahalanobis(poses: Float, constraints: list[Constraint]) -> Float:
 
 def _build_problem(poses: Float, chain: list[Constraint]) -> tuple[Any, Any]:
     """GTSAM's factor graph of the chain and the initial values."""
-    import gtsam  # loading it takes long
+    import gtsam
 
     start, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for k, pose in enumerate(_to_gtsam(poses)):
         start.insert(k, pose)
     _add_factors(graph, chain, np.ones(len(chain)))
     return graph, start
-
-
-def _fix_first(graph: Any, poses: Float) -> None:
-    """Add the first of the poses (K, D+1, D+1) to GTSAM's factor graph, known exactly."""
-    import gtsam
-
-    is_2d = poses.shape[-1] == 3
-    fixed = gtsam.noiseModel.Isotropic.Sigma(3 if is_2d else 6, _PRIOR_STD)
-    prior_factor = gtsam.PriorFactorPose2 if is_2d else gtsam.PriorFactorPose3
-    graph.add(prior_factor(0, _to_gtsam(poses[:1])[0], fixed))
 
 
 def _solve(graph: Any, start: Any, tolerance: float) -> Any:

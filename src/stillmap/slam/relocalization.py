@@ -166,8 +166,8 @@ def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[Loop
     segment = keyframes[(keyframes >= first) & (keyframes < last)]
     before = keyframes[keyframes < first]
     signatures = np.array([_range_signature(context, t) for t in before])
-    window = context.search_distance, np.pi
-    std = (window[0] / loop_verification.SEARCH_STDS, window[1] / loop_verification.SEARCH_STDS)
+    translation, rotation = context.search_distance, np.pi
+    std = translation / loop_verification.SEARCH_STDS, rotation / loop_verification.SEARCH_STDS
     submaps = {}
     for later in _select_evenly(segment, _MAX_QUERIES):
         distance = np.abs(signatures - _range_signature(context, later)).sum(axis=1)
@@ -179,11 +179,7 @@ def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[Loop
             earlier = int(before[same[np.argmin(distance[same])]])
             candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
             closure = loop_verification.verify_candidate(
-                context,
-                submaps[stretch],
-                candidate,
-                *std,
-                min_explained=loop_verification.MIN_EXPLAINED,
+                context, submaps[stretch], candidate, *std, loop_verification.MIN_EXPLAINED
             )
             if not closure.rejected:
                 yield closure
@@ -282,12 +278,8 @@ def _is_same(context: LoopContext, correction: Float, closure: LoopClosure) -> b
 
 def _offset_beside(context: LoopContext, first: int) -> Float:
     """(3, 3) that moves the scans from `first` on to the right of all earlier ones."""
-    max_range = np.array(
-        [
-            np.linalg.norm(context.hits(t).points, axis=1).max(initial=0.0)
-            for t in context.keyframes.tolist()
-        ]
-    )
+    points = [context.hits(t).points for t in context.keyframes.tolist()]
+    max_range = np.array([np.linalg.norm(of_scan, axis=1).max(initial=0.0) for of_scan in points])
     x, is_new = context.poses[context.keyframes, 0, 2], context.keyframes >= first
     right = (x + max_range)[~is_new].max()
     left = (x - max_range)[is_new].min()
@@ -311,19 +303,6 @@ class Evidence(Enum):
     AGREES = "agrees"
     CONTRADICTS = "contradicts"
     UNKNOWN = "unknown"
-
-
-@dataclass(frozen=True)
-class LookAhead:
-    """Result of `look_ahead`.
-
-    Attributes:
-        contradicts: whether the scans ahead contradict the map.
-        last: the last scan that was compared.
-    """
-
-    contradicts: bool
-    last: int
 
 
 def is_gap(seconds: float, usual: float) -> bool:
@@ -358,8 +337,8 @@ def look_ahead(
     t: int,
     T_map_base: Float,
     usual: float,
-) -> LookAhead:
-    """Compares spaced scans from t on with the map, at poses by odometry.
+) -> tuple[bool, int]:
+    """Whether spaced scans from t on contradict the map, at poses by odometry, and the last one.
 
     Args:
         recording: 2D.
@@ -375,7 +354,8 @@ def look_ahead(
     for k in range(t, min(t + _MAX_SCANS, recording.n_scans)):
         if k > t:
             pose = pose @ increments[k - 1]
-            step, turn = _size(increments[k - 1])
+            x, y, theta = se2.parameters(increments[k - 1])
+            step, turn = float(np.hypot(x, y)), abs(float(theta))
             seconds = 1e-9 * float(recording.stamp_ns[k] - recording.stamp_ns[k - 1])
             since += step + turn + SPACING_PER_SECOND * seconds
             travelled, metres = travelled + step + turn, metres + step
@@ -391,10 +371,4 @@ def look_ahead(
         if n_decisive >= _ENOUGH_DECISIVE and metres >= _MIN_TRAVEL:
             break
     least = max(_MIN_CONTRADICTING_SCANS, _CONTRADICTION_RATIO * counts[Evidence.AGREES])
-    return LookAhead(counts[Evidence.CONTRADICTS] >= least, k)
-
-
-def _size(increment: Float) -> tuple[float, float]:
-    """m and rad."""
-    x, y, theta = se2.parameters(increment)
-    return float(np.hypot(x, y)), abs(float(theta))
+    return counts[Evidence.CONTRADICTS] >= least, k

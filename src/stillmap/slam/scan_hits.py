@@ -41,7 +41,7 @@ class Scan:
 
 
 def transform_points(points: Float32, T: Float) -> Float32:
-    """Float32 (N, D) float32 transformed by (D+1, D+1)."""
+    """Points (N, D) float32 transformed by (D+1, D+1)."""
     return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
 
 

@@ -2,10 +2,10 @@
 
 Where a car occludes the road behind it whenever a place is seen, the cells alone take its side for
 a wall. Its path shows that it was there at these times: only hits at other times are evidence of
-the place itself.
+the place itself. Walkers explain hits as well if their tracks certainly are of movers.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,11 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
-from stillmap.tracking.mover_path import MoverPath
+from stillmap.tracking.association import ACCELERATION
+from stillmap.tracking.clustering import DynamicPoints
+from stillmap.tracking.detections import compute_centroids, iterate_tracks
+from stillmap.tracking.mover_path import MoverPath, smooth_track
+from stillmap.tracking.objects import SMOOTHER_STD, estimate_center_offset
 
 _ROUNDS = 100  # of EM at most
 _TOLERANCE = 1e-6  # of the share, at which EM ends
@@ -186,3 +190,33 @@ def _keys(xy: Float) -> Int64:
     """(n,) one key per square of the plane."""
     square = np.floor(xy / _CELL).astype(np.int64)
     return np.asarray((square[:, 0] << 32) + square[:, 1], np.int64)
+
+
+_MIN_P_MOVER = 0.99  # what explains hits must be certain: clutter would make more of itself
+_WIDTH = 0.5  # m, of a person
+_MIN_TRAVEL, _MIN_LOOKS = 1.5, 5  # m, several times that; looks
+
+
+def iterate_walker_paths(
+    points: DynamicPoints, owner: Index, p_mover: Float, others: Container[int]
+) -> Iterator[tuple[int, MoverPath]]:
+    """Yield tracks that are certainly movers and went somewhere, and their paths.
+
+    Args:
+        points: dynamic end points.
+        owner: (N,) their tracks.
+        p_mover: (K,) by track.
+        others: tracks that are left out.
+    """
+    for track, here in iterate_tracks(points, owner):
+        if track in others or p_mover[track] <= _MIN_P_MOVER:
+            continue
+        found = compute_centroids(points, owner, here)
+        scan, xy = found.scan, found.xy
+        if len(scan) < _MIN_LOOKS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
+            continue
+        at = np.searchsorted(scan, points.scan[here])
+        center = xy + estimate_center_offset(xy, points.sensor[scan], points.xy[here], at)
+        t = points.seconds[scan]
+        smooth = smooth_track(t, center, SMOOTHER_STD, ACCELERATION)
+        yield track, MoverPath(t, *smooth, _WIDTH, _WIDTH, is_round=True)

@@ -15,8 +15,7 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
-from stillmap.tracking.mover_path import MoverPath, fit_path
-from stillmap.tracking.vehicle_filter import MAX_SPEED, MIN_SPEED, follow
+from stillmap.tracking.mover_path import MAX_SPEED, MIN_SPEED, MoverPath, fit_path, follow
 
 _MAX_FRAGMENT = 0.6  # s: tracks of walkers that last for longer are none
 _MAX_STEP = 0.45  # s between two looks of a seed

@@ -23,12 +23,16 @@ from stillmap.em.shape_evidence import find_lost_beams
 from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
-from stillmap.tracking.detections import compute_centroids, iterate_tracks
-from stillmap.tracking.explained_hits import explain_hits, find_mover_hits, fit_share
+from stillmap.tracking.detections import compute_centroids, count_steady_windows, iterate_tracks
+from stillmap.tracking.explained_hits import (
+    explain_hits,
+    find_mover_hits,
+    fit_share,
+    iterate_walker_paths,
+)
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.tracklets import join_tracklets
-from stillmap.tracking.walker_paths import count_steady_windows, iterate_walker_paths
 
 Places = tuple[Index, Float]  # scans (n,) and positions (n, 2) of one track
 

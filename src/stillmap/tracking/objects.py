@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import pydantic
 
 from stillmap.core import arrays
 from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.config import STRICT, option
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks
@@ -20,10 +22,8 @@ from stillmap.tracking.clustering import (
 )
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
-from stillmap.tracking.mover_path import MoverPath
-from stillmap.tracking.options import ObjectOptions
+from stillmap.tracking.mover_path import MoverPath, smooth_track
 from stillmap.tracking.tracklets import stitch_tracklets
-from stillmap.tracking.vehicle_filter import smooth_track
 
 HEADING_SPEED = 0.3  # m/s: a faster object is heading where it moves
 
@@ -33,6 +33,16 @@ _MAX_OFFSET = 0.9  # m, half the width of a car
 _PATH_REACH = 1.0  # s for which a path goes on at constant velocity
 _VEHICLE_ACCELERATION = 4.0  # m2/s3
 _OUTLIERS = 5.0  # percent of the points on either side outside the box: legs swing
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=STRICT)
+class ObjectOptions:
+    """Tracking of moving objects; see `docs/objects.md`."""
+
+    enabled: bool = option(True, "Detect and track moving objects.")
+    min_extent: float = option(
+        0.15, "Minimum extent of an object plus its path, in metres.", ge=0.0, le=1000.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
