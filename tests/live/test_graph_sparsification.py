@@ -10,12 +10,12 @@ import stillmap
 from stillmap.core import se2
 from stillmap.live import graph_sparsification, loop_closer
 from stillmap.live.graph_sparsification import AnchoredPoses
-from stillmap.live.local_map import MappedScan, SpacedView
+from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.scan import to_beams
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.types import LoopClosure
+from stillmap.slam.types import LoopClosure, LoopContext
 
 SIDE = 10.0  # m of a square; scans 0.5 m apart, every second one a keyframe
 LAP = round(4 * SIDE / 0.5)
@@ -32,13 +32,13 @@ def drive(laps):
     return se2.matrix(*xy.T, heading)
 
 
-def view_of(poses, travelled):
+def context_of(poses, travelled, keyframes):
     n = len(poses)
     recording = of_one_sensor(
         np.arange(n) * 10**9, np.arange(n + 1), np.ones((n, 2), np.float32), np.ones(n, np.bool_)
     )
-    flat = np.zeros((n, 3, 3))
-    return SpacedView(recording, np.ones(n, np.float32), poses, travelled, np.ones(n), flat)
+    e, explained, flat = np.ones(n, np.float32), np.ones(n), np.zeros((n, 3, 3))
+    return LoopContext(recording, e, poses, travelled, explained, keyframes, 0.05, 1.0, 6.0, flat)
 
 
 def tie(first, second, rejected=""):
@@ -50,13 +50,13 @@ def state_of(poses, keyframes, loops):
 
 
 def laps_with_loops(laps):
-    """A view, its keyframes, and the loops of all keyframes but those of the first lap, each with
-    the keyframe at the same place one lap before."""
+    """A context, and the loops of all keyframes but those of the first lap, each with the keyframe
+    at the same place one lap before."""
     poses = drive(laps)
-    view = view_of(poses, 0.5 * np.arange(len(poses)))
     keyframes = np.arange(0, len(poses), 2)
     loops = [tie(k - LAP, k) for k in keyframes.tolist() if k >= LAP]
-    return view, keyframes, state_of(poses, keyframes, loops)
+    context = context_of(poses, 0.5 * np.arange(len(poses)), keyframes)
+    return context, state_of(poses, keyframes, loops)
 
 
 def count_passes(stay):
@@ -65,8 +65,7 @@ def count_passes(stay):
 
 
 def test_the_first_and_the_latest_passes_stay():
-    view, keyframes, state = laps_with_loops(20)
-    stay = graph_sparsification.select_scans(view, keyframes, state)
+    stay = graph_sparsification.select_scans(*laps_with_loops(20))
     passes = count_passes(stay)
     assert passes[0] == 1.0
     assert (passes[1:12] == 0.0).all()
@@ -80,31 +79,31 @@ def test_as_many_stay_after_twice_the_travel():
 
 
 def test_stretches_that_no_loop_ties_stay():
-    view, keyframes, state = laps_with_loops(20)
+    context, state = laps_with_loops(20)
     loops = [one for one in state.found if not 5 * LAP <= one.later < 6 * LAP]
     loops = [one for one in loops if not 5 * LAP <= one.earlier < 6 * LAP]
-    state = state_of(view.poses, keyframes, loops)
-    passes = count_passes(graph_sparsification.select_scans(view, keyframes, state))
+    state = state_of(context.poses, context.keyframes, loops)
+    passes = count_passes(graph_sparsification.select_scans(context, state))
     assert passes[5] == 1.0
     assert passes[4] == 0.0
 
 
 def test_scans_of_a_robot_that_stands_leave():
     poses = np.concatenate([np.eye(3)[None].repeat(40, axis=0), drive(1)])
-    view = view_of(poses, np.append(np.zeros(40), 0.5 * np.arange(LAP)))
     keyframes = np.append(0, np.arange(41, len(poses), 2))
-    stay = graph_sparsification.select_scans(view, keyframes, state_of(poses, keyframes, []))
+    context = context_of(poses, np.append(np.zeros(40), 0.5 * np.arange(LAP)), keyframes)
+    stay = graph_sparsification.select_scans(context, state_of(poses, keyframes, []))
     assert stay[0]
     assert not stay[1:40].any()
     assert stay[41:].all()
 
 
 def test_a_loop_to_a_scan_that_leaves_becomes_one_to_the_nearest_that_stays():
-    view, keyframes, state = laps_with_loops(20)
-    stay = graph_sparsification.select_scans(view, keyframes, state)
+    context, state = laps_with_loops(20)
+    stay, keyframes = graph_sparsification.select_scans(context, state), context.keyframes
     moved = graph_sparsification.select_state(state, keyframes, stay)
     kept = np.flatnonzero(stay)
-    poses = view.poses[kept]
+    poses = context.poses[kept]
     assert len(moved.attempted) == len(moved.found)
     assert len(moved.fitting) == stay[keyframes][LAP // 2 :].sum()
     later = [one.later for one in moved.found]

@@ -9,8 +9,8 @@ import stillmap
 from stillmap.core import se2
 from stillmap.live import local_map as module
 from stillmap.live.local_map import LocalMap, MappedScan
-from stillmap.live.observation import select_hits
 from stillmap.live.scan import to_beams
+from stillmap.live.scan_odometry import select_hits
 from stillmap.slam.motion_model import gaussian_prior
 from stillmap.slam.scan_matching import refine_pose
 

@@ -8,9 +8,8 @@ from stillmap.core import se2
 from stillmap.em.options import EmOptions
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.loop_closer import Correction
-from stillmap.live.map_frame import LabelledScan, MapCorrection
-from stillmap.live.observation import Observation
-from stillmap.live.scan import to_beams
+from stillmap.live.map_frame import MapCorrection
+from stillmap.live.scan import Observation, to_beams
 
 BEAMS, BINS, MEANWHILE = 720, 6, 12  # time bins before the correction, and while it goes on
 # by whole cells: none is seen between two of them
@@ -24,13 +23,13 @@ def look(k):
     ranges[np.abs(angles - 0.2 * k) < 0.1] = 4.0
     beams = to_beams(stillmap.Scan(k * 500_000_000, ranges, angles))
     T = se2.matrix(0.3 * k + 0.013, 0.007, 0.0)
-    return LabelledScan(Observation(beams, np.full(BEAMS, 0.1, np.float32)), T)
+    return Observation(beams, T, np.full(BEAMS, 0.1, np.float32))
 
 
 def make_labels(scans):
     labels = CausalLabels(2, 0.05, EmOptions())
     for scan in scans:
-        labels.add(scan.observation, scan.T)
+        labels.add(scan, scan.T)
     return labels
 
 
@@ -44,7 +43,7 @@ def correct_in_parts(labels, scans):
     while not is_done:
         scan = next(scans, None)
         if scan is not None:
-            labels.add(scan.observation, scan.T)
+            labels.add(scan, scan.T)
             correction.note_labelled(scan)
         is_done = correction.step(labels)
         blocks.append(correction._block)
@@ -81,7 +80,7 @@ def test_a_scan_that_is_added_again_changes_nothing(time_bin):
     """Its time bin is not open any more, but in cells that nobody saw since."""
     labels = make_labels([look(k) for k in range(6)])
     before = states(labels)
-    labels.add(look(time_bin).observation, look(time_bin).T)
+    labels.add(look(time_bin), look(time_bin).T)
     after = states(labels)
     assert before.keys() == after.keys()
     off = [abs(before[cell] - after[cell]) for cell in before]

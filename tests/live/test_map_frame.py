@@ -10,9 +10,8 @@ from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.loop_closer import Correction
-from stillmap.live.map_frame import LabelledScan, MapFrame
-from stillmap.live.observation import Observation
-from stillmap.live.scan import to_beams
+from stillmap.live.map_frame import MapFrame
+from stillmap.live.scan import Observation, to_beams
 
 CARRIED = 7  # spaced scans before the robot was carried, 1 m apart; as many scans after each
 MOTION = se2.matrix(0.0, 3.0, 0.0)  # of what was mapped since
@@ -57,8 +56,8 @@ def run():
         beams = to_beams(stillmap.Scan(k * 10**9, np.full(3, 2.0), np.full(3, 1e-3)))
         poses.append(T)
         anchors.append(frame.last)
-        labelled = LabelledScan(Observation(beams, np.full(3, 0.1, np.float32), frame.tag), T)
-        labels.add(labelled.observation, T)
+        observation = Observation(beams, T, np.full(3, 0.1, np.float32), frame.tag)
+        labels.add(observation, T)
         added = None
         if k % 4 == 0:
             added = MappedScan(beams, np.ones(3, np.float32), T, 0.25 * k)
@@ -67,7 +66,7 @@ def run():
             since = np.arange(len(closer.poses)) > CARRIED
             moved = np.where(since[:, None, None], MOTION @ closer.poses, closer.poses)
             closer.found = Correction(MOTION, moved, [])
-        frame.correct(labelled, added, labels, odometry)
+        frame.correct(observation, added, labels, odometry)
     return frame, labels, np.array(poses), np.array(anchors)
 
 

@@ -16,9 +16,8 @@ from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.loop_closer import Correction
 from stillmap.live.map_frame import MapCorrection, rotate_covariance
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
-from stillmap.live.scan import to_beams
+from stillmap.live.scan import Observation, to_beams
 from stillmap.results.eval.trajectory import compute_absolute_errors
 
 
@@ -110,7 +109,7 @@ def test_parts_that_emptied_are_told():
     labels = CausalLabels(2, 0.05, EmOptions())
     angles = np.linspace(-1.0, 1.0, 200)
     beams = to_beams(stillmap.Scan(0, np.full(200, 3.0), angles))
-    labels.add(Observation(beams, np.full(200, 0.1, np.float32)), np.eye(3))
+    labels.add(Observation(beams, np.eye(3), np.full(200, 0.1, np.float32)), np.eye(3))
     before = {tuple(change.first_cell) for change in labels.take_changes(0)}
     moved = labels.filter.sibling()
     take_over(moved, labels.filter, se2.matrix(2.0, 0.0, 0.0)[None], 0, labels.filter.block_count)
@@ -132,7 +131,7 @@ def test_cells_hit_while_a_correction_goes_on_move_with_it():
 
     def see(stamp, tag):
         beams = to_beams(stillmap.Scan(stamp, np.full(200, 3.0), angles))
-        labels.add(Observation(beams, margin, tag), np.eye(3))
+        labels.add(Observation(beams, np.eye(3), margin, tag), np.eye(3))
 
     see(0, 0)
     T, here = se2.matrix(2.0, 0.0, 0.0), np.eye(3)[None]
@@ -295,6 +294,6 @@ def test_what_is_kept_does_not_change_with_the_answer(corridor):
         update = mapper.push(corridor.beams[0], corridor.recording.T_odom_base[0])
         update.p_static[:] = update.pose[:] = 0.0
         snapshot = mapper.snapshot()
-        np.testing.assert_array_equal(snapshot.answers.p_static, corridor.updates[0].p_static)
-        np.testing.assert_array_equal(snapshot.answers.poses, corridor.poses[:1])
+        np.testing.assert_array_equal(snapshot.p_static, corridor.updates[0].p_static)
+        np.testing.assert_array_equal(snapshot.given, corridor.poses[:1])
         assert snapshot.recording.n_scans == 1

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import CellProbabilities
 from stillmap.em.observations import P_DETECTION
 from stillmap.em.options import EmOptions
-from stillmap.live.observation import Observation
-from stillmap.live.scan import ScanBeams
+from stillmap.live.scan import Observation, ScanBeams
 
 _AZIMUTH = 0.006  # rad, of a pixel; lidars have finer steps than that
 _MIN_ELEVATION, _MAX_ELEVATION, _FACTOR = 0.005, 0.07, 1.15  # rad
@@ -141,26 +141,25 @@ class CausalLabels:
 
     def label(self, beams: ScanBeams, T_map_base: Float) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of a scan at a pose; NaN: unusable."""
-        T = (T_map_base @ beams.T_base_sensor)[None]
-        offset = np.array([0, len(beams.points)])
-        return self.filter.label(
-            beams.points, beams.hit, offset, T, self._prior, threads=self._threads
-        )
+        return self._label(beams.points, beams.hit, T_map_base @ beams.T_base_sensor, self._prior)
 
     def label_ends(self, points: NDArray[np.float32], T_map_base: Float) -> NDArray[np.float32]:
         """(N,) P(static) of hits that end at points (N, D) in the base frame, with the prior of the
         map."""
-        every, offset = np.ones(len(points), np.bool_), np.array([0, len(points)])
-        T = T_map_base[None]
-        return self.filter.label(points, every, offset, T, _MAP_PRIOR, threads=self._threads)
+        return self._label(points, np.ones(len(points), np.bool_), T_map_base, _MAP_PRIOR)
 
-    def doubt(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N,) P(static) of `label` with the prior of what was only just seen."""
-        return _doubt(e, self._prior)
+    def _label(
+        self, points: NDArray[np.float32], hit: NDArray[np.bool_], T: Float, prior: float
+    ) -> NDArray[np.float32]:
+        offset = np.array([0, len(points)])
+        return self.filter.label(points, hit, offset, T[None], prior, threads=self._threads)
 
-    def doubt_ends(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N,) P(static) of `label_ends` with the prior of what was only just seen."""
-        return _doubt(e, _MAP_PRIOR)
+    def doubt(self, e: NDArray[np.float32], *, of_ends: bool = False) -> NDArray[np.float32]:
+        """(N,) P(static) of `label`, or of `label_ends`, with the prior of what was only just
+        seen."""
+        prior = _MAP_PRIOR if of_ends else self._prior
+        odds = _RECENT_PRIOR / (1.0 - _RECENT_PRIOR) * (1.0 - prior) / prior
+        return np.asarray(odds * e / (odds * e + (1.0 - e)), np.float32)
 
     def add(
         self, observation: Observation, T_map_base: Float, to: OccupancyFilter | None = None
@@ -206,34 +205,27 @@ class CausalLabels:
             self._pixels[beams.sensor] = size
         return size
 
-    def to_map(self) -> GridMap:
-        """The planar map of what stands; NaN: unknown."""
-        return self._to_map(self._odds_factor)
-
-    def to_view(self) -> GridMap:
-        """The same without the prior of the map: for comparison with another map."""
-        return self._to_map(1.0)
-
-    def _to_map(self, odds_factor: float) -> GridMap:
+    def to_map(self, *, is_seen_alone: bool = False) -> GridMap:
+        """The planar map of what stands; NaN: unknown. For comparison with another map without the
+        prior of the map."""
         assert isinstance(self.filter, _core.OccupancyFilter2D)
-        first, p_occupied = self.filter.dense(odds_factor=odds_factor)
+        factor = 1.0 if is_seen_alone else self._odds_factor
+        first, p_occupied = self.filter.dense(odds_factor=factor)
         x, y = (first * self.resolution).tolist()
         return GridMap(p_occupied, (x, y, 0.0), self.resolution)
 
-    def known_cells(self, of: OccupancyFilter | None = None) -> CellProbabilities:
+    def known_cells(
+        self, of: OccupancyFilter | None = None, *, is_seen_alone: bool = False
+    ) -> CellProbabilities:
         """P(static and occupied) of the cells in which beams ended.
 
         Args:
             of: filters; None: those of the labels.
+            is_seen_alone: without the prior of the map, for comparison with another map.
         """
         known = self.filter if of is None else of
-        cells, p_occupied = known.known_cells(odds_factor=self._odds_factor)
-        return CellProbabilities(cells, p_occupied, 0.0)
-
-    def seen_cells(self) -> CellProbabilities:
-        """The same without the prior of the map: for comparison with another map."""
-        cells, p_occupied = self.filter.known_cells(odds_factor=1.0)
-        return CellProbabilities(cells, p_occupied, 0.0)
+        factor = 1.0 if is_seen_alone else self._odds_factor
+        return CellProbabilities(*known.known_cells(odds_factor=factor), 0.0)
 
     def take_changes(self, stamp_ns: int) -> list[MapChange]:
         """Parts of the map that changed, so many since the call before that each is told about once
@@ -258,19 +250,7 @@ class CausalLabels:
         return changes
 
 
-def _doubt(e: NDArray[np.float32], prior: float) -> NDArray[np.float32]:
-    """(N,) P(static) with that prior, with the prior of what was only just seen."""
-    odds = _RECENT_PRIOR / (1.0 - _RECENT_PRIOR) * (1.0 - prior) / prior
-    return np.asarray(odds * e / (odds * e + (1.0 - e)), np.float32)
-
-
-def take_over(
-    to: OccupancyFilter, source: OccupancyFilter, motion: Float, first: int, count: int
-) -> int:
+def take_over(to: OccupancyFilter, source: Any, motion: Float, first: int, count: int) -> int:
     """Add `count` blocks of a filter of the same kind from `first` on, moved by the motions
     (K, D+1, D+1) of their tags; returns the first block that is left."""
-    if isinstance(to, _core.OccupancyFilter2D):
-        assert isinstance(source, _core.OccupancyFilter2D)
-        return to.take_over(source, motion, first, count)
-    assert isinstance(source, _core.SweepFilter3D)
     return to.take_over(source, motion, first, count)

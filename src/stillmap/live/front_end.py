@@ -1,16 +1,14 @@
-"""The front end of live mapping, in 2D and 3D: what registers the scans."""
+"""What the front ends of live mapping, in 2D and 3D, tell: registered scans, and crowds."""
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.local_map import Labeller, MappedScan
-from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
 
@@ -154,51 +152,3 @@ class Registration(ShortRepr):
     is_carried: bool = False
     is_contradicted: bool = False
     has_odometry: bool = False
-
-
-class FrontEnd(Protocol):
-    """Registers scans as they arrive: `ScanOdometry` in 2D, `SweepOdometry` in 3D.
-
-    Hits and priors are those of the registration in 2D or 3D.
-    """
-
-    crowd: Crowd
-    local_map: Any
-    left_behind: Any  # the local map before the robot was carried
-
-    def predict(self, beams: ScanBeams, increment: Float | None, /) -> Any:
-        """The prior of the next scan, given the increment (D+1, D+1) of odometry."""
-
-    def select(self, beams: ScanBeams, prior: Any, /) -> Any:
-        """The hits of a scan with weight 1."""
-
-    def end_points(self, hits: Any, prior: Any, /) -> tuple[NDArray[np.float32], Float]:
-        """(N, D) points of the hits in the base frame at the stamp, and its pose, as predicted."""
-
-    def register(
-        self, beams: ScanBeams, hits: Any, prior: Any, increment: Float | None, /
-    ) -> Registration:
-        """Register a scan, (9), by its hits with weights P(static)."""
-
-    def add(
-        self,
-        beams: ScanBeams,
-        e: NDArray[np.float32],
-        recent: NDArray[np.float32],
-        label: Labeller,
-        /,
-    ) -> MappedScan | None:
-        """Add the last scan to the local map, unless it contradicts it; the scan if it is spaced.
-
-        Args:
-            beams: of the scan, as if taken at its stamp.
-            e: (N,) P(static).
-            recent: (N,) the same with the prior of what was only just seen, for the local map.
-            label: labels an earlier scan again, after a second.
-        """
-
-    def enter(self, local_map: Any, T: Float, /) -> None:
-        """Go on in another map, in whose frame the frame so far has the pose T."""
-
-    def correct(self, local_map: Any, motion: Float, /) -> None:
-        """Go on with a local map made anew, in 3D None, after the map has moved (D+1, D+1)."""

@@ -1,18 +1,22 @@
-"""Global localization: the pose of the robot in a known map, without a prior."""
+"""Global localization: the pose of the robot in a map, without a prior."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.core.short_repr import ShortRepr
-from stillmap.live.known_map import KnownMap, to_surface_map
+from stillmap.core.local_frame import LocalFrame
+from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
+from stillmap.live.known_map import KeptMap, KnownLocalMap, KnownMap, to_surface_map
+from stillmap.live.local_map import LocalMap
 from stillmap.places.alignment import search_alignments
 from stillmap.places.surface_map import CONFLICT_WEIGHT, SurfaceMap, compare_surfaces
 from stillmap.results.reader import OCCUPIED_THRESH
@@ -40,19 +44,6 @@ _STD = 0.15, 0.04  # m, rad: of an alignment that the search finds
 _MAX_CANDIDATES = 20
 
 
-@dataclass(frozen=True, eq=False)
-class Localization(ShortRepr):
-    """Result of global localization.
-
-    Attributes:
-        T: (D+1, D+1) of the searched view in the known map; None: not known.
-        is_ambiguous: several places fit about as well.
-    """
-
-    T: Float | None
-    is_ambiguous: bool = False
-
-
 class _Alignment(NamedTuple):
     """A pose of the view, its evidence, and how many of its surfaces the map shows."""
 
@@ -71,6 +62,9 @@ class GlobalLocalizer:
             show.
         sure_agree: share of them below which the robot may as well be elsewhere: then the map must
             show what comes into view later, too.
+
+    Attributes:
+        is_ambiguous: several places fit the last view about as well.
     """
 
     def __init__(
@@ -80,6 +74,7 @@ class GlobalLocalizer:
         gone_weight: float = CONFLICT_WEIGHT,
         sure_agree: float = -np.inf,
     ) -> None:
+        self.is_ambiguous = False
         self._min_agree, self._sure_agree = min_agree, sure_agree
         self._gone_weight = gone_weight
         self._known, self._surface = known, known.make_surface_map()
@@ -91,8 +86,8 @@ class GlobalLocalizer:
         """The view begins anew, in another frame."""
         self._last = None
 
-    def localize(self, view: GridMap, scan: Scan, pose: Float) -> Localization:
-        """Pose of a local map in the known map.
+    def localize(self, view: GridMap, scan: Scan, pose: Float) -> Float | None:
+        """(3, 3) of a view in the known map; None: the evidence is not clear.
 
         Args:
             view: what was seen since the robot was lost, as a map in a frame of its own.
@@ -101,25 +96,24 @@ class GlobalLocalizer:
         """
         return self.search(view, lambda T: self._refine(scan, T @ pose) @ se2.inverse(pose))
 
-    def search(self, view: GridMap, refine: Callable[[Float], Float]) -> Localization:
-        """Pose of a local map in the known map.
+    def search(self, view: GridMap, refine: Callable[[Float], Float]) -> Float | None:
+        """As `localize`.
 
         Args:
             view: as of `localize`.
             refine: a better alignment (3, 3) near the one given, which the search found.
         """
+        self.is_ambiguous = False
         if np.count_nonzero(view.p_occupied > OCCUPIED_THRESH) < _MIN_SURFACE:  # maybe none at all
-            return Localization(None)
+            return None
         session = to_surface_map(view)
         if len(session.surface) < _MIN_SURFACE:
-            return Localization(None)
-        alignments = list[_Alignment]()
+            return None
         proposed = search_alignments(self._surface, session, _FREE_WEIGHT, self._gone_weight)
-        for T in proposed[:_MAX_CANDIDATES]:
-            alignments.append(self._weigh(session, refine(T)))
+        alignments = [self._weigh(session, refine(T)) for T in proposed[:_MAX_CANDIDATES]]
         return self._choose(sorted(alignments, key=lambda alignment: -alignment.evidence), session)
 
-    def _choose(self, alignments: list[_Alignment], session: SurfaceMap) -> Localization:
+    def _choose(self, alignments: list[_Alignment], session: SurfaceMap) -> Float | None:
         """The best alignment, if the evidence is clear."""
         last, self._last = self._last, None
         squares = len(session.surface)
@@ -128,28 +122,26 @@ class GlobalLocalizer:
             or alignments[0].agree < self._min_agree * squares
             or alignments[0].evidence <= 0.0
         ):
-            return Localization(None)
+            return None
         best = alignments[0]
         rivals = [rival.evidence for rival in alignments[1:] if _is_apart(best.T, rival.T)]
         share = max(rivals, default=0.0) / best.evidence
-        if share > max(_MAX_RIVAL.values()):
-            return Localization(None, is_ambiguous=True)
-        is_same = last is not None and not _is_apart(last, best.T)
-        self._last, self._times = best.T, self._times + 1 if is_same else 1
-        if self._first is None or not is_same:
-            self._first = session
+        if share <= max(_MAX_RIVAL.values()):
+            is_same = last is not None and not _is_apart(last, best.T)
+            self._last, self._times = best.T, self._times + 1 if is_same else 1
+            if self._first is None or not is_same:
+                self._first = session
         if not any(self._times >= n and share <= most for n, most in _MAX_RIVAL.items()):
-            return Localization(None, is_ambiguous=True)
+            self.is_ambiguous = True
+            return None
         # in walls that the map shows and the robot does not see, too
         is_sure = min(best.agree, best.evidence) >= self._sure_agree * squares
-        is_here = is_sure or self._predicts(session, best.T)
-        return Localization(best.T if is_here else None)
+        return best.T if is_sure or self._predicts(session, best.T) else None
 
     def _predicts(self, session: SurfaceMap, T: Float) -> bool:
         """True if under an alignment the map shows what came into view since it was the best."""
         assert self._first is not None
         fresh = ~self._first.is_near(session.surface)
-        T = np.asarray(T)
         points = session.surface[fresh] @ T[:2, :2].T + T[:2, 2]
         shown = self._surface.look_up(points, session.surface_sides[fresh] @ T[:2, :2].T)
         count = int(fresh.sum())
@@ -174,3 +166,131 @@ class GlobalLocalizer:
 def _is_apart(first: Float, second: Float) -> bool:
     x, y, theta = se2.parameters(se2.inverse(first) @ second)
     return bool(np.hypot(x, y) > _APART[0] or abs(theta) > _APART[1])
+
+
+class Localizer(ABC):
+    """A map in 2D or 3D in which a robot that is lost is searched.
+
+    Attributes:
+        frame: of the search, in the map frame.
+        is_lost: the robot is not found in it yet.
+        is_ambiguous: several places fit about as well.
+    """
+
+    frame, is_lost, is_ambiguous = LocalFrame(), True, False
+
+    @property
+    def route(self) -> Float:
+        """(T, D) from where the map was made, in 3D, once the robot is found in it."""
+        return np.zeros((0, 2))
+
+    def lose(self, labels: CausalLabels) -> None:
+        """The robot was carried: the labels begin anew."""
+        self._forget(labels)
+        self.is_lost = True
+
+    @abstractmethod
+    def localize(self, labels: CausalLabels, scan: Any, pose: Float) -> Float | None:
+        """(D+1, D+1) of the frame of the labels in the map, if the evidence is clear.
+
+        Args:
+            labels: of what was seen since the robot was lost.
+            scan: the last one; in 2D its hits.
+            pose: (D+1, D+1) of the robot in the frame of the labels.
+        """
+
+    def enter(self, labels: CausalLabels, T: Float) -> None:
+        """The robot is found: labels go on from the map, with what was seen since it was lost."""
+        self.is_lost, seen = False, labels.filter
+        known = self._known_filter(seen.sibling())
+        take_over(known, seen, np.tile(T, (labels.tags, 1, 1)), 0, seen.block_count)
+        labels.filter = known
+
+    @abstractmethod
+    def keep(self, labels: CausalLabels) -> KeptMap:
+        """The part of the known map that an extended one keeps, as of now; `labels`: so far."""
+
+    @abstractmethod
+    def _forget(self, labels: CausalLabels) -> None:
+        """Begin anew, with labels of the map, or of elsewhere where the robot was lost already."""
+
+    @abstractmethod
+    def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+        """Filters of cells with what the map knows; `empty`: such of the same kind."""
+
+    @abstractmethod
+    def make_local_map(self, local_map: Any, T: Float) -> Any:
+        """The map that scans are matched against from now on.
+
+        Args:
+            local_map: that of what was seen since the robot was lost.
+            T: (D+1, D+1) by which that moves in its frame.
+        """
+
+
+class PlanarLocalizer(Localizer):
+    """A planar map of an earlier run.
+
+    Args:
+        known: the map.
+        extends: whether scans are added to it.
+    """
+
+    def __init__(self, known: KnownMap, extends: bool) -> None:
+        self.frame, self._known, self._extends = known.frame, known, extends
+        self._global: GlobalLocalizer | None
+        self._global = GlobalLocalizer(known, sure_agree=MIN_AGREE_ANYWHERE)
+
+    def localize(self, labels: CausalLabels, scan: Scan, pose: Float) -> Float | None:
+        """Search what was seen since the robot was lost."""
+        if self._global is None:
+            return None
+        T = self._global.localize(labels.to_map(is_seen_alone=True), scan, pose)
+        self.is_ambiguous = self._global.is_ambiguous
+        return T
+
+    def _forget(self, labels: CausalLabels) -> None:
+        if self._global is not None:
+            self._global.forget()
+        labels.clear()
+
+    def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+        self._known.prime(empty)
+        return empty
+
+    def make_local_map(self, _local_map: LocalMap, _T: Float) -> LocalMap:
+        """The known map."""
+        return KnownLocalMap(self._known, self._extends)
+
+    def keep(self, _labels: CausalLabels) -> KeptMap:
+        """The map as it was."""
+        return KeptMap(self._known.in_map_frame, self._known.hits)
+
+
+class OwnMap(PlanarLocalizer):
+    """The planar map so far, which a robot was carried out of, or to another place in.
+
+    Args:
+        labels: of that map; from now on they are those of what is seen elsewhere.
+        local_map: likewise.
+    """
+
+    def __init__(self, labels: CausalLabels, local_map: Any) -> None:
+        self._filter = labels.filter
+        self._local_map: LocalMap = local_map
+        self._global = None
+        with suppress(InputError):  # an empty map
+            # it may be where it has never been; the map is that of a moment ago
+            self._global = GlobalLocalizer(KnownMap(labels.to_map()), MIN_AGREE_ANYWHERE)
+        self._forget(labels)
+
+    def _forget(self, labels: CausalLabels) -> None:
+        labels.filter = self._filter.sibling()
+
+    def _known_filter(self, _empty: OccupancyFilter) -> OccupancyFilter:
+        return self._filter
+
+    def make_local_map(self, local_map: LocalMap, T: Float) -> LocalMap:
+        """The local map of before with that of what was seen since."""
+        self._local_map.join(local_map, T)
+        return self._local_map

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.array_types import Index
-from stillmap.live.local_map import SpacedView
 from stillmap.slam.loop_candidates import MIN_LOOP_TRAVEL
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.loop_verification import CLOSURE_ROTATION, CLOSURE_TRANSLATION, SUBMAP_TRAVEL
-from stillmap.slam.types import LoopClosure
+from stillmap.slam.types import LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -66,39 +65,43 @@ class AnchoredPoses:
         return np.append(self._graph, known + np.arange(count - len(self._graph)))
 
 
-def select_scans(view: SpacedView, keyframes: Index, state: LoopState) -> Mask:
+def select_scans(context: LoopContext, state: LoopState) -> Mask:
     """(S,) the spaced scans that stay.
 
     Stretches of `SUBMAP_TRAVEL` stay or leave whole: a submap needs all scans of one. Those stay
     that first showed a place, the latest few that show it, and those that no loop ties to others.
 
     Args:
-        view: all spaced scans.
-        keyframes: (K,) of them.
-        state: loops of these keyframes, and their corrected poses.
+        context: all spaced scans.
+        state: loops of its keyframes, and their corrected poses.
     """
-    stretch = (view.travelled // SUBMAP_TRAVEL).astype(np.int64)
-    travelled, of = view.travelled[keyframes], stretch[keyframes]
+    keyframes, stretch = context.keyframes, (context.travelled // SUBMAP_TRAVEL).astype(np.int64)
+    travelled, of = context.travelled[keyframes], stretch[keyframes]
     near = [
         alike[np.abs(travelled[alike] - travelled[k]) > MIN_LOOP_TRAVEL]
         for k, alike in enumerate(_iter_near(state.poses))
     ]
     stay = _find_first(of, near) | _find_indispensable(travelled, of, keyframes, state.fitting)
     stay |= _find_latest(of, near, stay)
-    is_recent = view.travelled > view.travelled[-1] - _RECENT
+    is_recent = context.travelled > context.travelled[-1] - _RECENT
     out: Mask = is_recent | np.isin(stretch, of[stay])
-    return out & ~_find_standing(view.poses, keyframes)
+    return out & ~_find_standing(context.poses, keyframes)
 
 
 def _iter_near(poses: Float) -> Iterator[Index]:
     """For each of the poses (K, 3, 3) those that show the same place, itself among them."""
-    x = se2.parameters(poses)
-    for first in range(0, len(x), _ROWS):
-        rows = x[first : first + _ROWS, None]
-        away = np.hypot(rows[..., 0] - x[:, 0], rows[..., 1] - x[:, 1])
-        turn = np.abs(se2.wrap(rows[..., 2] - x[:, 2]))
+    for away, turn in _iter_distances(poses, poses):
         for row in (away < _PLACE_DISTANCE) & (turn < _PLACE_ANGLE):
             yield np.flatnonzero(row)
+
+
+def _iter_distances(poses: Float, among: Float) -> Iterator[tuple[Float, Float]]:
+    """(n, K) m and rad between some of the poses (N, 3, 3) after others and poses (K, 3, 3)."""
+    x, known = se2.parameters(poses), se2.parameters(among)
+    for first in range(0, len(x), _ROWS):
+        rows = x[first : first + _ROWS, None]
+        away = np.hypot(rows[..., 0] - known[:, 0], rows[..., 1] - known[:, 1])
+        yield away, np.abs(se2.wrap(rows[..., 2] - known[:, 2]))
 
 
 def _find_first(of: Index, near: Sequence[Index]) -> Mask:
@@ -145,14 +148,8 @@ def _find_standing(poses: Float, keyframes: Index) -> Mask:
 
 def find_nearest(poses: Float, among: Float) -> Index:
     """(n,) the nearest ones among poses (K, 3, 3) of poses (n, 3, 3), by m and rad."""
-    x, known = se2.parameters(poses), se2.parameters(among)
-    nearest = np.zeros(len(x), np.intp)
-    for first in range(0, len(x), _ROWS):
-        rows = x[first : first + _ROWS, None]
-        away = np.hypot(rows[..., 0] - known[:, 0], rows[..., 1] - known[:, 1])
-        turn = np.abs(se2.wrap(rows[..., 2] - known[:, 2]))
-        nearest[first : first + _ROWS] = np.argmin(away + turn, axis=1)
-    return nearest
+    rows = [np.argmin(away + turn, axis=1) for away, turn in _iter_distances(poses, among)]
+    return np.concatenate([np.zeros(0, np.intp), *rows])
 
 
 def select_state(state: LoopState, keyframes: Index, stay: Mask) -> LoopState:

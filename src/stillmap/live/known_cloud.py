@@ -3,13 +3,13 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.array_folder import open_npy
+from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
 from stillmap.em import CellProbabilities, GroundMap
@@ -67,17 +67,6 @@ class KnownPlanes:
         return np.array(list(self._route.values())).reshape(-1, 4, 4)
 
 
-class KnownVoxels(NamedTuple):
-    """(K, 3) voxels, and (K,) whether surface runs there; else they are free."""
-
-    cells: Index
-    is_surface: NDArray[np.bool_]
-
-    def prime(self, labels: _core.SweepFilter3D) -> None:
-        """Tell the filters of voxels what is known of them."""
-        labels.prime(self.cells, self.is_surface, LOG_RATIO)
-
-
 class KnownCloud:
     """A map in 3D to localize in.
 
@@ -115,8 +104,11 @@ class KnownCloud:
         local.add(self.points, self.p_static, np.eye(4))
         return local
 
-    def find_voxels(self, edge: float, band: tuple[float, float]) -> "KnownVoxels":
-        """Voxels of the known map with which the labels are initialized.
+    def find_voxels(
+        self, edge: float, band: tuple[float, float]
+    ) -> tuple[Index, NDArray[np.bool_]]:
+        """(K, 3) voxels with which the labels are initialized, and (K,) whether surface runs there;
+        else they are free.
 
         Args:
             edge: m.
@@ -124,7 +116,7 @@ class KnownCloud:
         """
         surface = _cells_of(self.points, edge)
         cells = np.concatenate([surface, self._free_voxels(edge, band)])
-        return KnownVoxels(np.ascontiguousarray(cells), np.arange(len(cells)) < len(surface))
+        return np.ascontiguousarray(cells), np.arange(len(cells)) < len(surface)
 
     def keep(
         self,
@@ -200,10 +192,9 @@ def _find_standing(
     points: NDArray[np.float32], now: CellProbabilities, p_unseen: float, edge: float
 ) -> NDArray[np.bool_]:
     """(N,) which points (N, 3) lie in voxels that are still occupied."""
-    cells = _cells_of(points, edge)
+    cells, of = unique_cells(np.floor(points / edge).astype(np.int64))
     shared = _share_evidence(cells, _look_up(now, cells), p_unseen).astype(np.float32)
-    of_points = np.floor(points / edge).astype(np.int64)
-    return _look_up(CellProbabilities(cells, shared, 0.0), of_points) >= STANDS
+    return np.asarray(shared[of] >= STANDS)
 
 
 def _share_evidence(cells: Index, p_occupied: Float, p_unseen: float) -> Float:
@@ -247,17 +238,13 @@ def _read_route(folder: Path) -> Float:
     paths = [single] if single.exists() else sorted(folder.glob("sessions/*/trajectory.tum"))
     poses = [read_tum(path)[1] for path in paths]
     if (folder / ROUTE).exists():
-        poses.append(_check_route(folder / ROUTE))
+        route = open_npy(folder / ROUTE)
+        if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not are_rigid(route):
+            raise InputError("holds no poses", where=str(folder / ROUTE))
+        poses.append(route)
     if not sum(map(len, poses)):
         raise InputError("holds no trajectory", where=str(folder))
     return np.concatenate(poses)
-
-
-def _check_route(path: Path) -> Float:
-    route = open_npy(path)
-    if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not are_rigid(route):
-        raise InputError("holds no poses", where=str(path))
-    return route
 
 
 def _read_points(
@@ -282,18 +269,11 @@ def _read_points(
 
 def _sum_up(keys: Index, values: Float) -> tuple[Index, Float]:
     """Cells (N, D), each once, and the sums of their values (N, K)."""
-    if not len(keys):
-        return keys, values
-    low = keys.min(axis=0)
-    shape = tuple((keys.max(axis=0) - low + 1).tolist())
-    flat = np.ravel_multi_index(tuple((keys - low).T), shape)
-    order = np.argsort(flat, kind="stable")
-    flat = flat[order]
-    first = np.flatnonzero(np.append(True, flat[1:] != flat[:-1]))
-    return keys[order[first]], np.add.reduceat(values[order], first, axis=0)
+    cells, of = unique_cells(keys)
+    sums = [np.bincount(of, column, len(cells)) for column in values.T]
+    return cells, np.stack(sums, axis=1)
 
 
 def _cells_of(points: NDArray[np.floating], edge: float) -> Index:
     """(K, D) the cells of points (N, D), each once."""
-    cells = np.floor(points / edge).astype(np.int64)
-    return _sum_up(cells, np.zeros((len(cells), 1)))[0]
+    return unique_cells(np.floor(points / edge).astype(np.int64))[0]

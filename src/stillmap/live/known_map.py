@@ -2,7 +2,9 @@
 
 import dataclasses
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,36 +18,23 @@ from stillmap.core.grid_map import GridMap
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
-from stillmap.live.local_map import (
-    Labeller,
-    LocalMap,
-    MappedScan,
-    add_scan,
-    is_spaced,
-    relabel_scan,
-)
+from stillmap.live.causal_labels import OccupancyFilter
+from stillmap.live.local_map import Labeller, LocalMap, MappedScan, add_scan, relabel_scan
 from stillmap.pipeline.options import MapMode
 from stillmap.places.evidence import cell_keys
 from stillmap.places.surface_map import SurfaceMap, find_sides
+from stillmap.results import reader
 from stillmap.results.folder import ResultFolder
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.point_cloud import Block, cloud_from_folder
 from stillmap.results.points import append_vertices
-from stillmap.results.reader import (
-    FREE_THRESH,
-    OCCUPIED_THRESH,
-    RECORD,
-    Grid,
-    read_grid,
-    read_hit_sums,
-    read_run,
-)
+from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, RECORD, Grid, read_run
 from stillmap.slam import scan_hits
 
 Float = NDArray[np.float64]
 
 ROUTE = "live/known_route.npy"  # of a result that extends a map, from where that one was made
-Layer = NDArray[np.float32]
+Layer = NDArray[np.floating]
 
 _SQUARE = 2  # cells along the edge of a square of the surface map
 LOG_RATIO = 8.0  # nats by which the map speaks for static surface
@@ -107,39 +96,33 @@ class KeptMap(ShortRepr):
     cloud: KeptCloud | None = None
 
 
-class _Overlay:
-    """The box around two maps with the same axes and cells, one of which lies on the other."""
+def _make_room(
+    below: GridMap, above: GridMap
+) -> tuple[tuple[float, float, float], Callable[[Layer, float], Layer], Callable[..., Layer]]:
+    """The corner of the box around two maps with the same axes and cells, one of which lies on the
+    other, and what spreads layers of each over the box, with a value elsewhere."""
+    edge = above.resolution
+    shapes = np.array([grid.p_occupied.shape for grid in (below, above)])
+    corners = np.array([grid.origin[1::-1] for grid in (below, above)])
+    corners = np.round(corners / edge).astype(int)
+    low = corners.min(axis=0)
+    shape = ((corners + shapes).max(axis=0) - low).tolist()
 
-    def __init__(self, below: GridMap, above: GridMap) -> None:
-        edge = above.resolution
-        shapes = np.array([grid.p_occupied.shape for grid in (below, above)])
-        corners = np.array([grid.origin[1::-1] for grid in (below, above)])
-        corners = np.round(corners / edge).astype(int)
-        low, high = corners.min(axis=0), (corners + shapes).max(axis=0)
-        self._shape, self._corners = tuple((high - low).tolist()), corners - low
-        y, x = (low * edge).tolist()
-        self.origin = (x, y, 0.0)
-
-    def below(self, layer: NDArray[np.floating], fill: float) -> Layer:
-        """A layer of the lower map on the box; `fill` outside it."""
-        return self._spread(layer, fill, self._corners[0])
-
-    def above(self, layer: NDArray[np.floating], fill: float) -> Layer:
-        """The same of the upper one."""
-        return self._spread(layer, fill, self._corners[1])
-
-    def _spread(self, layer: NDArray[np.floating], fill: float, corner: NDArray[np.intp]) -> Layer:
-        out, (row, column) = np.full(self._shape, fill, np.float32), corner.tolist()
+    def spread(corner: tuple[int, int], layer: Layer, fill: float) -> Layer:
+        out, (row, column) = np.full(shape, fill, np.float32), corner
         out[row : row + layer.shape[0], column : column + layer.shape[1]] = layer
         return out
+
+    y, x = (low * edge).tolist()
+    lower, upper = (partial(spread, tuple(corner)) for corner in (corners - low).tolist())
+    return (x, y, 0.0), lower, upper
 
 
 def overlay(below: GridMap, above: GridMap) -> GridMap:
     """A map on which another one lies, where that one is known."""
-    box = _Overlay(below, above)
-    seen = box.above(above.p_occupied, np.nan)
-    p_occupied = np.where(np.isnan(seen), box.below(below.p_occupied, np.nan), seen)
-    return GridMap(p_occupied, box.origin, above.resolution)
+    origin, lower, upper = _make_room(below, above)
+    seen, known = upper(above.p_occupied, np.nan), lower(below.p_occupied, np.nan)
+    return GridMap(np.where(np.isnan(seen), known, seen), origin, above.resolution)
 
 
 def extend_map(kept: KeptMap, seen: OccupancyMap) -> OccupancyMap:
@@ -151,17 +134,17 @@ def extend_map(kept: KeptMap, seen: OccupancyMap) -> OccupancyMap:
         kept: a map whose axes are those of `seen`.
         seen: the map of this run.
     """
-    box, known = _Overlay(kept.grid, seen), kept.grid.p_occupied
-    p = box.above(seen.p_occupied, np.nan)
+    (origin, lower, upper), known = _make_room(kept.grid, seen), kept.grid.p_occupied
+    p = upper(seen.p_occupied, np.nan)
     use = ~np.isnan(p)
     if kept.cloud is not None:
-        use &= ~(box.below(np.where(kept.cloud.stands, known, np.nan), np.nan) > p)
+        use &= ~(lower(np.where(kept.cloud.stands, known, np.nan), np.nan) > p)
     return OccupancyMap(
-        np.where(use, p, box.below(known, np.nan)),
-        box.origin,
+        np.where(use, p, lower(known, np.nan)),
+        origin,
         seen.resolution,
-        np.where(use, box.above(seen.alpha, 0.0), box.below(kept.hits, 0.0)),
-        np.where(use, box.above(seen.beta, 0.0), np.float32(0.0)),
+        np.where(use, upper(seen.alpha, 0.0), lower(kept.hits, 0.0)),
+        np.where(use, upper(seen.beta, 0.0), np.float32(0.0)),
     )
 
 
@@ -197,8 +180,8 @@ class KnownMap:
             self.grid = Grid(source.p_occupied, source.origin, source.resolution)
             self.hits = self.grid.p_occupied
         else:
-            self.grid = read_grid(Path(source))
-            self.hits = read_hit_sums(Path(source), self.grid.p_occupied.shape)
+            self.grid = reader.read_grid(Path(source))
+            self.hits = reader.read_hit_sums(Path(source), self.grid.p_occupied.shape)
         self.frame = _find_frame(source, self.grid)
         corner = self.frame.corner_to_local(self.grid.origin)
         self.grid = dataclasses.replace(self.grid, origin=corner)
@@ -232,7 +215,7 @@ class KnownMap:
         """The map for the search of alignments."""
         return to_surface_map(self.grid)
 
-    def prime(self, labels: _core.OccupancyFilter2D) -> None:
+    def prime(self, labels: OccupancyFilter) -> None:
         """Tell the filters of cells what the map knows."""
         free = self.grid.centres(np.argwhere(self.grid.p_occupied < FREE_THRESH))
         centres = np.concatenate([self._centres, free])
@@ -253,20 +236,14 @@ class KnownLocalMap(LocalMap):
         super().__init__(known.resolution)
         self.grid, self._extends = known.make_grid(), extends
 
-    def add(self, scan: MappedScan) -> bool:
-        """Note a scan unless it is too close to the last one of its sensor; True if it was noted.
-        In a map that is extended, it is added."""
-        last = self._last.get(scan.beams.sensor)
-        if last is not None and not is_spaced(last, scan):
-            return False
+    def _insert(self, scan: MappedScan) -> None:
         self._last[scan.beams.sensor] = scan
         if self._extends:
             add_scan(self.grid, scan)
-            self._recent.append(scan)
-        return True
 
     def _relabel(self, scan: MappedScan, label: Labeller) -> None:
-        relabel_scan(self.grid, scan, label)
+        if self._extends:
+            relabel_scan(self.grid, scan, label)
 
     def remove_since(self, stamp_ns: int) -> None:
         """Nothing leaves a known map."""
@@ -280,7 +257,7 @@ def to_surface_map(grid: GridMap) -> SurfaceMap:
     """Surfaces and free space of an occupancy map, on squares of two cells."""
     from scipy import ndimage  # slow to load
 
-    at = grid if isinstance(grid, Grid) else Grid(grid.p_occupied, grid.origin, grid.resolution)
+    at = Grid(grid.p_occupied, grid.origin, grid.resolution)
     edge = _SQUARE * grid.resolution
     with np.errstate(invalid="ignore"):
         masks = grid.p_occupied > OCCUPIED_THRESH, grid.p_occupied < FREE_THRESH
@@ -288,20 +265,14 @@ def to_surface_map(grid: GridMap) -> SurfaceMap:
     both = np.concatenate(squares)
     low = both.min(axis=0) - 1
     shape = both.max(axis=0) + 2 - low
-    surface, passes = (_count(cells - low, shape) for cells in squares)
+    flat = [np.ravel_multi_index(tuple((cells - low).T), tuple(shape)) for cells in squares]
+    surface, passes = (np.bincount(at, minlength=shape.prod()).reshape(shape) for at in flat)
     passed = (passes >= _SQUARE**2 // 2) & (surface == 0)
     around = np.ones((3, 3), np.bool_)
     near = ndimage.binary_dilation(surface > 0, around)
     free = ndimage.binary_erosion(passed, around) & ~near
     points = (np.argwhere(surface > 0) + low + 0.5) * edge
     return SurfaceMap(points.astype(np.float32), low, near, free, find_sides(passed), edge)
-
-
-def _count(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(X, Y) number of the cells (n, 2)."""
-    rows, columns = shape.tolist()
-    counts = np.bincount(cells[:, 0] * columns + cells[:, 1], minlength=rows * columns)
-    return np.asarray(counts.reshape(rows, columns), np.int64)
 
 
 def _find_surfaces(grid: Grid, hits: NDArray[np.floating]) -> Float:

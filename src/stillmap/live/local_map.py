@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.core.arrays import GrowingArray
-from stillmap.core.recording import Recording
+from stillmap.core.array_types import Index
 from stillmap.core.short_repr import ShortRepr
+from stillmap.live.history import GrowingRecording
 from stillmap.live.scan import ScanBeams, take_beams
-from stillmap.slam import scan_hits
+from stillmap.slam import loop_closure, loop_closure_3d, scan_hits
 from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.types import LoopContext
 
 Float = NDArray[np.float64]
 
@@ -163,109 +165,70 @@ def add_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, *, remove: bool = Fa
     )
 
 
-@dataclass(frozen=True, eq=False)
-class SpacedView(ShortRepr):
-    """S spaced scans with M beams.
-
-    Attributes:
-        recording: the scans, without odometry.
-        e: (M,) float32, P(static).
-        poses: (S, D+1, D+1) in the frame of the odometry by scans.
-        travelled: (S,) m up to each.
-        explained: (S,) share of each that the local map explained.
-        drift: (S, 3, 3) covariance that the steps since the one before add, where scans say
-            nothing.
-    """
-
-    recording: Recording
-    e: NDArray[np.float32]
-    poses: Float
-    travelled: Float
-    explained: Float
-    drift: Float
-
-
-class SpacedScans:
+class SpacedScans(GrowingRecording):
     """Spaced scans, appended.
 
     Args:
         dimension: 2 or 3.
+        options: see SlamOptions.
         folder: of the temporary files; None: the system's.
+
+    Attributes:
+        keyframe_distance: m of travel between keyframes.
     """
 
-    def __init__(self, dimension: int, folder: Path | None = None) -> None:
-        D = dimension
-        fields = [
-            ("stamp_ns", np.int64),
-            ("sensor", np.int64),
-            ("pose", np.float64, (D + 1, D + 1)),
-            ("travelled", np.float64),
-            ("explained", np.float64),
-            ("drift", np.float64, (3, 3)),
-        ]
-        self._scans = GrowingArray(np.dtype(fields), scratch=folder)
-        self._points = GrowingArray(np.float32, (D,), scratch=folder)
-        self._hit = GrowingArray(np.bool_, scratch=folder)
-        self._e = GrowingArray(np.float32, scratch=folder)
-        self._offset = GrowingArray(np.int64, scratch=folder)
-        self._offset.append(np.zeros(1, np.int64))
-        self._mounts: dict[str | int, Float] = {}
+    def __init__(self, dimension: int, options: SlamOptions, folder: Path | None = None) -> None:
+        pose = (dimension + 1,) * 2
+        shapes = {"poses": pose, "travelled": (), "explained": (), "drift": (3, 3)}
+        notes = np.dtype([(name, np.float64, shape) for name, shape in shapes.items()])
+        super().__init__(dimension, notes, scratch=folder)
+        defaults = loop_closure if dimension == 2 else loop_closure_3d
+        search = options.loop_search_distance
+        self._search_distance = defaults.SEARCH_DISTANCE if search is None else search
+        self._resolution = options.resolution
+        self.keyframe_distance = options.keyframe_distance or defaults.KEYFRAME_DISTANCE
 
-    def __len__(self) -> int:
-        return len(self._scans)
+    def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
+        """Append a scan.
 
-    def append(self, scan: MappedScan, explained: float, drift: Float) -> None:
-        """Append a scan; see `SpacedView`.
+        Args:
+            scan: at its pose in the frame of the odometry by scans.
+            explained: share of it that the local map explained.
+            drift: (3, 3) covariance that the steps since the last one add, where scans say nothing.
 
         Raises:
             OSError: the disk is full.
         """
-        beams = scan.beams
-        self._mounts.setdefault(beams.sensor, beams.T_base_sensor)
-        row = np.zeros(1, self._scans.dtype)
-        row["stamp_ns"] = beams.stamp_ns
-        row["sensor"] = list(self._mounts).index(beams.sensor)
-        row["pose"], row["travelled"] = scan.T_map_base, scan.travelled
-        row["explained"], row["drift"] = explained, drift
-        self._points.append(beams.points)
-        self._hit.append(beams.hit)
-        self._e.append(scan.e)
-        self._offset.append(np.array([len(self._e)]))
-        self._scans.append(row)
-
-    def view(self) -> SpacedView:
-        """All scans so far."""
-        scans = self._scans.view()
-        recording = Recording(
-            stamp_ns=scans["stamp_ns"].copy(),
-            offset=np.array(self._offset.view()),
-            points=self._points.view(),
-            hit=self._hit.view(),
-            T_base_sensor=np.array(list(self._mounts.values())),
-            sensor=scans["sensor"].astype(np.int32),
-            T_odom_base=None,
+        self.append(
+            scan.beams,
+            scan.e,
+            poses=scan.T_map_base,
+            travelled=scan.travelled,
+            explained=explained,
+            drift=drift,
         )
-        fields = (scans[name].copy() for name in ("pose", "travelled", "explained", "drift"))
-        return SpacedView(recording, self._e.view(), *fields)
 
-    def scan(self, view: SpacedView, number: int) -> MappedScan:
-        """One of the scans of a view."""
-        recording = view.recording
-        beams, sensor = recording.beams_of(number), int(recording.sensor[number])
+    def context(self, keyframes: Index) -> LoopContext:
+        """All scans so far, of which some are keyframes."""
+        notes = self.notes()
+        assert notes.dtype.names is not None
+        return LoopContext(
+            self.recording(),
+            self.labels(),
+            keyframes=keyframes,
+            resolution=self._resolution,
+            keyframe_distance=self.keyframe_distance,
+            search_distance=self._search_distance,
+            **{name: notes[name].copy() for name in notes.dtype.names},
+        )
+
+    def scan(self, context: LoopContext, number: int) -> MappedScan:
+        """One of the scans of a context."""
+        recording = context.recording
+        sensor = list(self._mounts)[recording.sensor[number]]
         return MappedScan(
-            ScanBeams(
-                int(recording.stamp_ns[number]),
-                np.array(recording.points[beams]),
-                np.array(recording.hit[beams]),
-                recording.T_base_sensor[sensor],
-                list(self._mounts)[sensor],
-            ),
-            np.array(view.e[beams]),
-            view.poses[number],
-            float(view.travelled[number]),
+            ScanBeams.of(recording, number, sensor),
+            np.array(context.e[recording.beams_of(number)]),
+            context.poses[number],
+            float(context.travelled[number]),
         )
-
-    def close(self) -> None:
-        """Remove the files."""
-        for array in (self._scans, self._points, self._hit, self._e, self._offset):
-            array.close()

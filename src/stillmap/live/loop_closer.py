@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.graph_sparsification import AnchoredPoses, select_scans, select_state
-from stillmap.live.local_map import MappedScan, SpacedScans, SpacedView
+from stillmap.live.local_map import MappedScan, SpacedScans
 from stillmap.slam import local_map, loop_candidates, loop_closure
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions
@@ -28,7 +28,6 @@ _REPEATED_AFTER = 25.0  # m after which small corrections are reported: one may 
 # spaced scans, a kilometre of travel, before which none leaves the graph; how many times as many as
 # were left the last time there are when some leave again
 _MIN_SCANS, _GROWTH = 6000, 1.5
-_RELEASED_AFTER = 512  # scans that are read, after which the memory that they took is given back
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,7 @@ class LoopCloser:
     """
 
     def __init__(self, options: SlamOptions, folder: Path | None = None) -> None:
-        self._scans, self._folder = SpacedScans(2, folder), folder
+        self._scans, self._folder = SpacedScans(2, options, folder), folder
         self._options = options
         self._last: MappedScan | None = None
         self._keyframes: list[int] = []
@@ -91,152 +90,116 @@ class LoopCloser:
         self._due = _MIN_SCANS  # spaced scans from which some leave
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
-        """Add a spaced scan at its pose in the frame of the odometry by scans.
-
-        Args:
-            scan: the scan.
-            explained: share of it that the local map explained.
-            drift: (3, 3) covariance that the steps since the last one add, where scans say nothing.
-        """
+        """Add a spaced scan, see `SpacedScans.add`."""
         if self._last is not None:
             step = se2.parameters(se2.inverse(self._last.T_map_base) @ scan.T_map_base)
-            self._since += float(np.hypot(*step[:2])) / self._keyframe_distance
+            self._since += float(np.hypot(*step[:2])) / self._scans.keyframe_distance
             self._since += abs(float(step[2])) / local_map.KEYFRAME_ANGLE
         if self._since >= 1.0:
             self._keyframes.append(len(self._scans))
             self._since = 0.0
         self._last = scan
-        self._scans.append(scan, explained, drift)
+        self._scans.add(scan, explained, drift)
 
     def poll(self) -> Correction | None:
-        """Search loops where that is due; None: nothing changed."""
-        return self.close() if self.is_due else None
+        """Search loops where the robot has driven so far that they are worth it; None: hardly
+        anything changed."""
+        is_due = (
+            self._last is not None
+            and len(self._keyframes) > len(self._state.poses) + 1
+            and self._last.travelled >= self._searched_until + _EVERY
+        )
+        return self._close() if is_due else None
 
     def stop(self) -> None:
         """Remove temporary files."""
         self._scans.close()
 
-    @property
-    def is_due(self) -> bool:
-        """True if the robot has driven so far that loops are worth a search."""
-        return (
-            self._last is not None
-            and len(self._keyframes) > len(self._state.poses) + 1
-            and self._last.travelled >= self._searched_until + _EVERY
-        )
-
-    def close(self) -> Correction | None:
-        """Search loops of the keyframes since the last search; None: hardly anything changed."""
-        view = self._scans.view()
-        context = self._context(view)
+    def _close(self) -> Correction | None:
+        """Search loops of the keyframes since the last search."""
+        context = self._scans.context(np.array(self._keyframes, np.intp))
         first, last = len(self._state.poses), len(context.keyframes)
-        self._searched_until = float(view.travelled[-1])
-        since = self._T_map_local @ view.poses[len(self._poses) :]
-        self._poses = np.concatenate([self._poses, since])
-        since = self._reported_T_map_local @ view.poses[len(self._reported) :]
-        self._reported = np.concatenate([self._reported, since])
+        self._searched_until = float(context.travelled[-1])
+        self._poses = _extend(self._poses, self._T_map_local, context.poses)
+        self._reported = _extend(self._reported, self._reported_T_map_local, context.poses)
         chain = loop_candidates.odometry_constraints(context, self._options.odometry, [])
         new = context.keyframes[first:]
         self._centers = np.concatenate(
             [self._centers, loop_candidates.view_centers(replace(context, keyframes=new))]
         )
         before = self._state
-        poses = np.concatenate([before.poses, self._T_map_local @ context.poses[new]])
+        poses = _extend(before.poses, self._T_map_local, context.poses[context.keyframes])
         state = replace(before, poses=poses)
         self._state = loop_closure.close_stage(context, chain, self._centers, state, first, last)
         is_changed = not np.array_equal(self._state.poses, poses)
-        correction = self._correct(view, context) if is_changed else None
+        correction = self._correct(context) if is_changed else None
         if len(self._scans) >= self._due:
-            self._sparsify(view, context)
+            self._sparsify(context)
         return correction
 
-    def _correct(self, view: SpacedView, context: LoopContext) -> Correction | None:
-        keyframes, poses = context.keyframes, self._state.poses
+    def _correct(self, context: LoopContext) -> Correction | None:
+        keyframes, poses, end = context.keyframes, self._state.poses, len(context.poses) - 1
         self._T_map_local = poses[-1] @ se2.inverse(context.poses[keyframes[-1]])
-        every = np.append(keyframes, len(view.poses) - 1)
         last = self._T_map_local @ context.poses[-1]
-        self._poses = corrected = local_map.propagate_corrections(
-            context.poses, *_without_repetition(every, np.concatenate([poses, last[None]]))
-        )
+        if keyframes[-1] < end:
+            keyframes, poses = np.append(keyframes, end), np.concatenate([poses, last[None]])
+        corrected = local_map.propagate_corrections(context.poses, keyframes, poses)
+        self._poses = corrected
         is_large = not is_small(self._reported, corrected, last @ se2.inverse(self._reported[-1]))
-        now = float(view.travelled[-1])
+        now = float(context.travelled[-1])
         if not is_large and now < self._reported_at + _REPEATED_AFTER:
             return None
         self._reported_at = now
         if is_large:
             self._reported, self._reported_T_map_local = corrected, self._T_map_local
-        near = self._find_near(view, context)
+        near = self._find_near(context)
         return Correction(self._T_map_local, self._anchored.place(corrected), near)
 
-    def _sparsify(self, view: SpacedView, context: LoopContext) -> None:
+    def _sparsify(self, context: LoopContext) -> None:
         """Take scans out of the graph. The others stay as they are in the map."""
-        stay = select_scans(view, context.keyframes, self._state)
+        stay, keyframes = select_scans(context, self._state), context.keyframes
         local = se2.inverse(self._T_map_local) @ self._poses
-        scans = SpacedScans(2, self._folder)
-        for n, s in enumerate(np.flatnonzero(stay).tolist(), start=1):
-            scan = replace(self._scans.scan(view, s), T_map_base=local[s])
-            scans.append(scan, float(view.explained[s]), view.drift[s])
-            if n % _RELEASED_AFTER == 0:
-                context.recording.release_pages(context.e)
-        context.recording.release_pages(context.e)
+        scans = SpacedScans(2, self._options, self._folder)
+        for s in context.recording.iter_scans(np.flatnonzero(stay).tolist(), context.e):
+            scan = replace(self._scans.scan(context, s), T_map_base=local[s])
+            scans.add(scan, float(context.explained[s]), context.drift[s])
         self._scans.close()
         self._scans = scans
         self._anchored.remove(stay, self._poses)
-        self._state = select_state(self._state, context.keyframes, stay)
-        self._centers = self._centers[stay[context.keyframes]]
-        self._keyframes = (np.cumsum(stay) - 1)[context.keyframes[stay[context.keyframes]]].tolist()
+        self._state = select_state(self._state, keyframes, stay)
+        self._centers = self._centers[stay[keyframes]]
+        self._keyframes = (np.cumsum(stay) - 1)[keyframes[stay[keyframes]]].tolist()
         self._poses, self._reported = self._poses[stay], self._reported[stay]
         self._due = max(_MIN_SCANS, round(_GROWTH * len(scans)))
 
-    def _find_near(self, view: SpacedView, context: LoopContext) -> list[MappedScan]:
+    def _find_near(self, context: LoopContext) -> list[MappedScan]:
         """The scans of the local map: near the robot along the graph and in the map.
 
         Of earlier travel one, the last, for each metre and heading.
         """
-        k = len(context.keyframes) - 1
+        k, travelled = len(context.keyframes) - 1, context.travelled
         metres = loop_candidates.graph_distances(context, k, self._state.fitting)
-        scans = np.arange(len(view.poses))
+        scans = np.arange(len(context.poses))
         of = np.clip(np.searchsorted(context.keyframes, scans, side="right") - 1, 0, k)
         away = np.hypot(*(self._poses[:, :2, 2] - self._poses[-1, :2, 2]).T)
-        now = float(view.travelled[-1])
+        now = float(travelled[-1])
         is_near = (metres[of] <= _NEAR_TRAVEL) & (away <= _NEAR_DISTANCE)
-        is_recent = view.travelled >= now - _NEAR_TRAVEL
+        is_recent = travelled >= now - _NEAR_TRAVEL
         local = se2.inverse(self._T_map_local) @ self._poses
-        earlier = dict[tuple[int, ...], int]()
-        for s in np.flatnonzero(is_near & ~is_recent).tolist():
-            x, y, theta = se2.parameters(local[s])
-            key = (int(np.floor(x)), int(np.floor(y)), int(np.floor(theta / _HEADING)))
-            earlier[key] = s
+        earlier = np.flatnonzero(is_near & ~is_recent)
+        places = np.floor(se2.parameters(local[earlier]) / (1.0, 1.0, _HEADING)).astype(np.int64)
+        last_of = dict(zip(map(tuple, places.tolist()), earlier.tolist(), strict=True))
         recent = np.flatnonzero(is_near & is_recent).tolist()
         return [
             replace(
-                self._scans.scan(view, s),
+                self._scans.scan(context, s),
                 T_map_base=local[s],
-                travelled=float(view.travelled[s]) if is_recent[s] else now,
+                travelled=float(travelled[s]) if is_recent[s] else now,
             )
-            for s in (*recent, *earlier.values())
+            for s in (*recent, *last_of.values())
         ]
 
-    def _context(self, view: SpacedView) -> LoopContext:
-        search = self._options.loop_search_distance
-        return LoopContext(
-            view.recording,
-            view.e,
-            view.poses,
-            view.travelled,
-            view.explained,
-            np.array(self._keyframes, np.intp),
-            self._options.resolution,
-            self._keyframe_distance,
-            loop_closure.SEARCH_DISTANCE if search is None else search,
-            view.drift,
-        )
 
-    @property
-    def _keyframe_distance(self) -> float:
-        return self._options.keyframe_distance or loop_closure.KEYFRAME_DISTANCE
-
-
-def _without_repetition(scans: NDArray[np.intp], poses: Float) -> tuple[NDArray[np.intp], Float]:
-    kept = np.append(True, np.diff(scans) > 0)
-    return scans[kept], poses[kept]
+def _extend(poses: Float, T_map_local: Float, local: Float) -> Float:
+    """(S, 3, 3) poses in the map, of which the last are known by those in the local frame alone."""
+    return np.concatenate([poses, T_map_local @ local[len(poses) :]])

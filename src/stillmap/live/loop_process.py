@@ -118,18 +118,10 @@ class LoopProcess:
                     self._incoming.append(replace(correction, near=near))
 
 
-def start_closer(
-    options: SlamOptions, dimension: int, background: bool, folder: Path | None, threads: int
-) -> LoopCloser | LiveSweepLoopCloser | LoopProcess:
-    """A loop closer for 2D or 3D, in a process of its own or in this one."""
-    if background:
-        return LoopProcess(options, dimension, folder)
-    return _make_closer(options, dimension, folder, threads)
-
-
-def _make_closer(
+def make_closer(
     options: SlamOptions, dimension: int, folder: Path | None, threads: int
 ) -> LoopCloser | LiveSweepLoopCloser:
+    """A loop closer for 2D or 3D, in this process."""
     if dimension == 2:
         return LoopCloser(options, folder)
     return LiveSweepLoopCloser(options, folder, threads)
@@ -140,7 +132,7 @@ def _close_loops(source: IO[bytes], target: IO[bytes]) -> None:
     messages = receive(source)
     options, dimension, folder = next(messages)
     # one thread: the other cores answer scans
-    closer = _make_closer(options, dimension, folder, threads=1)
+    closer = make_closer(options, dimension, folder, threads=1)
     arrived = queue.SimpleQueue[Any]()
 
     def listen() -> None:

@@ -2,21 +2,22 @@
 
 import logging
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from stillmap.core import se2
 from stillmap.core.parallel import trim_heap
-from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
-from stillmap.live.front_end import FrontEnd, Registration
+from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan, thin_scan
 from stillmap.live.loop_closer import Correction, LoopCloser, is_small
 from stillmap.live.loop_process import LoopProcess
-from stillmap.live.observation import Observation
+from stillmap.live.scan import Observation
+from stillmap.live.scan_odometry import ScanOdometry
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
+from stillmap.live.sweep_odometry import SweepOdometry
 from stillmap.slam import local_map
 
 Float = NDArray[np.float64]
@@ -29,6 +30,7 @@ SPACED_PER_TAG = {2: 4, 3: 1}
 _KEPT_EVERY_NS = {2: 0, 3: 500_000_000}  # between two of them
 _MIN_SHIFT = 0.5  # cells by which the map must move for its cells to be moved
 LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess
+FrontEnd = ScanOdometry | SweepOdometry
 
 _log = logging.getLogger(__name__)
 
@@ -36,19 +38,6 @@ _log = logging.getLogger(__name__)
 _MAX_KEPT_BEAMS = {2: 400, 3: 20_000}
 _FIRST_SPACED = 256  # spaced scans for which there is room at first
 _TRIM_EVERY = 128  # spaced scans after which freed memory is given back: 10 ms after an answer
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledScan(ShortRepr):
-    """A scan that was added to the labels.
-
-    Attributes:
-        observation: of the scan.
-        T: (D+1, D+1) pose of the base in the frame of the odometry by scans.
-    """
-
-    observation: Observation
-    T: Float
 
 
 class MapCorrection:
@@ -88,12 +77,12 @@ class MapCorrection:
         self.filter: OccupancyFilter = self._source.sibling() if self.moves_cells else self._source
         self._block = 0
         self._scans = deque(sorted(correction.near, key=lambda scan: scan.travelled))
-        self._labelled = deque[LabelledScan]()
+        self._labelled = deque[Observation]()
         self._kept_ns = 0
 
-    def note_labelled(self, scan: LabelledScan) -> None:
+    def note_labelled(self, scan: Observation) -> None:
         """Tell of a scan that was added to the labels meanwhile."""
-        stamp_ns = scan.observation.beams.stamp_ns
+        stamp_ns = scan.beams.stamp_ns
         if self.moves_cells and stamp_ns - self._kept_ns >= _KEPT_EVERY_NS[self._D]:
             self._labelled.append(scan)
             self._kept_ns = stamp_ns
@@ -117,7 +106,7 @@ class MapCorrection:
             return False
         for _ in range(min(_ADDED_PER_STEP[self._D], len(self._labelled))):
             scan = self._labelled.popleft()
-            labels.add(scan.observation, self.T_map_local @ scan.T, self.filter)
+            labels.add(scan, self.T_map_local @ scan.T, self.filter)
         return not self._labelled
 
     def finish(self, labels: CausalLabels) -> None:
@@ -202,7 +191,7 @@ class MapFrame:
 
     def correct(
         self,
-        labelled: LabelledScan | None,
+        labelled: Observation | None,
         added: MappedScan | None,
         labels: CausalLabels,
         odometry: FrontEnd,
@@ -331,8 +320,6 @@ class MapFrame:
 def rotate_covariance(covariance: Float, T: Float) -> Float:
     """Covariance of a pose along the axes of another frame, in which its own frame has the pose
     T (D+1, D+1): (3, 3) of x, y and heading, in 3D (6, 6) of translation and rotation."""
-    R, turn = T[:-1, :-1], np.eye(len(covariance))
-    turn[: len(R), : len(R)] = R
-    if len(R) == 3:
-        turn[3:, 3:] = R
+    R = T[:-1, :-1]
+    turn = block_diag(R, R if len(R) == 3 else np.eye(1))
     return np.asarray(turn @ covariance @ turn.T)

@@ -19,10 +19,10 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.from_arrays import poses_to_matrices
+from stillmap.live.global_localization import Localizer, PlanarLocalizer
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.live.online_slam import OnlineSlam
-from stillmap.live.place import Localizer, PlanarLocalizer
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.sweep_localization import SweepLocalizer
@@ -145,7 +145,10 @@ class LiveMapper:
         """(T, D+1, D+1) T_map_base of the scans that are kept, as they are known now; NaN where the
         place in the map is not known: while the robot is lost, or if it was carried away before it
         was found."""
-        return np.zeros((0, 3, 3)) if self._slam is None else self._slam.placement().known_poses()
+        if self._slam is None:
+            return np.zeros((0, 3, 3))
+        poses, submap = self._slam.placement()
+        return np.where((submap == 0)[:, None, None], poses, np.nan)
 
     @property
     def path(self) -> Float:
@@ -163,26 +166,19 @@ class LiveMapper:
         if self._slam.dimension == 2:
             grid = labels.to_map()
         else:
-            band, cells = (output.min_obstacle_height, output.max_obstacle_height), self._cells()
-            grid = project_obstacles(cells, self._slam.route(), band, self.resolution)
+            band = output.min_obstacle_height, output.max_obstacle_height
+            cells, route = labels.known_cells(), self._slam.route()
+            grid = project_obstacles(cells, route, band, self.resolution)
         origin = self._slam.known_frame.corner_to_map(grid.origin)
         return dataclasses.replace(grid, origin=origin)
 
     @property
     def cells(self) -> CellProbabilities:
         """P(static and occupied) of the cells, in 3D voxels, in which beams ended."""
-        known = self._cells()
-        if self._slam is None or not self._slam.known_frame.is_shifted:
-            return known
-        origin = self._slam.known_frame.origin[: known.cells.shape[1]]
-        by = np.round(origin / self.resolution).astype(np.int64)
-        return dataclasses.replace(known, cells=known.cells + by)
-
-    def _cells(self) -> CellProbabilities:
-        """The same in the frame of the labels."""
         if self._slam is None:
             return CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0.0)
-        return self._slam.labels.known_cells()
+        known = self._slam.labels.known_cells()
+        return dataclasses.replace(known, cells=known.cells + self._slam.cell_shift)
 
     @property
     def resolution(self) -> float:
@@ -224,10 +220,14 @@ class LiveMapper:
         history = slam.history
         if not history.kept:
             raise InputError("no scan could be kept: the disk was full")
-        recording, answers = history.recording(), history.answers()
-        kept_map = slam.keep_map() if self._mode == "extend" else None
         return Snapshot(
-            recording, answers, slam.placement(), self.options, history.folder, kept_map
+            history.recording(),
+            history.notes()["pose"].copy(),
+            history.labels(),
+            *slam.placement(),
+            self.options,
+            history.folder,
+            slam.keep_map() if self._mode == "extend" else None,
         )
 
     def move_folder(self, folder: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import kalman
+from stillmap.core.arrays import unique_cells
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import adjacent_pairs, component_labels
 from stillmap.live.scan import ScanBeams
@@ -257,12 +258,9 @@ def _connect(ends: Float) -> tuple[Float, Index, Index]:
 def _connect_cells(ends: Float) -> tuple[Float, Index, Index]:
     """The means (m, D) of the end points in each cell, the cluster of each cell, and how many end
     points each cluster has: neighbouring cells are connected."""
-    cell = np.floor(ends / _CELL).astype(np.int64)
-    cell -= cell.min(axis=0)
-    flat = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
-    _, first, of = np.unique(flat, return_index=True, return_inverse=True)
+    cells, of = unique_cells(np.floor(ends / _CELL).astype(np.int64))
     sums = [np.bincount(of, x) for x in ends.T]
-    cluster = component_labels(adjacent_pairs(cell[first]), len(first))
+    cluster = component_labels(adjacent_pairs(cells), len(cells))
     return np.stack(sums, axis=1) / np.bincount(of)[:, None], cluster, np.bincount(cluster[of])
 
 

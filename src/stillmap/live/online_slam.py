@@ -1,7 +1,8 @@
 """Online SLAM: the state of one mapping, and the steps by which it takes a scan."""
 
 import dataclasses
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +12,20 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
-from stillmap.live.causal_labels import CausalLabels, MapChange
-from stillmap.live.front_end import FrontEnd, Registration
-from stillmap.live.history import History, Placement
+from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.front_end import Registration
+from stillmap.live.global_localization import Localizer
+from stillmap.live.history import History
 from stillmap.live.known_map import KeptMap
 from stillmap.live.local_map import MappedScan
-from stillmap.live.loop_process import start_closer
-from stillmap.live.map_frame import LabelledScan, MapFrame, rotate_covariance
-from stillmap.live.movers import Mover, MoverTracker
-from stillmap.live.observation import BeamSelector, Observation, find_margins, normals_of, thin
-from stillmap.live.place import Localizer
+from stillmap.live.loop_process import LoopProcess, make_closer
+from stillmap.live.map_frame import FrontEnd, LoopClosing, MapFrame, rotate_covariance
+from stillmap.live.movers import MoverTracker
 from stillmap.live.robot_finder import RobotFinder
-from stillmap.live.scan import ScanBeams, deskew
-from stillmap.live.scan_odometry import ScanOdometry
+from stillmap.live.scan import BeamSelector, Observation, ScanBeams, deskew, find_margins
+from stillmap.live.scan_odometry import ScanOdometry, thin
 from stillmap.live.sweep_odometry import SweepOdometry
-from stillmap.live.update import Hindsight, LaterLabels, Update
+from stillmap.live.update import LaterLabels, Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam.scan_hits import Scan as PlanarHits
 
@@ -80,10 +80,13 @@ class OnlineSlam:
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
         self._place, self._finder = place, RobotFinder(place, D)
-        self._hindsight = Hindsight(lag)
-        closer = None
-        if place is None and slam.loop_closure:
-            closer = start_closer(slam, D, in_background, scratch, threads)
+        self._lag_ns = None if lag is None else round(1e9 * lag)
+        self._recent = deque[tuple[int, ScanBeams]]()  # scans to be labelled once more
+        closer: LoopClosing | None = None
+        if place is None and slam.loop_closure and in_background:
+            closer = LoopProcess(slam, D, scratch)
+        elif place is None and slam.loop_closure:
+            closer = make_closer(slam, D, scratch, threads)
         self.frame = MapFrame(D, closer, in_background)
         self._work_left: Callable[[], object] | None = None  # by the last scan
         self._T_odom_base: Float | None = None  # of the last scan
@@ -98,16 +101,16 @@ class OnlineSlam:
         """
         self.update_map()
         increment = self._increment(T_odom_base)
-        prior = self.odometry.predict(beams, increment)
-        hits = self.odometry.select(beams, prior)
+        prior: Any = self.odometry.predict(beams, increment)
+        hits: Any = self.odometry.select(beams, prior)
         hits = self._weigh(hits, prior)  # E-step as predicted
         registered = self.odometry.register(beams, hits, prior, increment)  # M-step: (9)
         self._judge(registered)
         deskewed, anchor = deskew(beams, registered.twist), self.frame.last
-        labelled = LabelledScan(self._observe(deskewed, hits), registered.T)
+        observation = self._observe(deskewed, hits, registered.T)
         pose = self.frame.T_map_local @ registered.T
         if not registered.is_contradicted:
-            self.labels.add(labelled.observation, pose)
+            self.labels.add(observation, pose)
         p_static = self.labels.label(deskewed, pose)  # E-step: (8)
         self._movers.add(deskewed, registered.T, p_static)
         self._T_odom_base = T_odom_base
@@ -124,8 +127,9 @@ class OnlineSlam:
                 anchor=anchor,
                 twist=registered.twist,
             )
-            self._hindsight.add(len(self.history) - 1, beams)
-            return self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), registered)
+            if self._lag_ns is not None:
+                self._recent.append((len(self.history) - 1, beams))
+            return self._add_to_maps(observation, np.nan_to_num(p_static), registered)
 
         if not self._finder.is_lost:
             self._work_left = keep
@@ -154,16 +158,16 @@ class OnlineSlam:
         pose = self.frame.to_map(local, int(answer["anchor"]), number)
         return self.labels.label(deskew(beams, answer["twist"]), pose)
 
-    def placement(self) -> Placement:
-        """Poses and submaps of the scans that are kept, as they are estimated now."""
-        answers, is_whole = self.history.answers(), self.history.kept == len(self.history)
-        poses = self._finder.move_all(answers.local)
+    def placement(self) -> tuple[Float, NDArray[np.int64]]:
+        """Poses and submaps of the scans that are kept, as they are known now: see `Snapshot`."""
+        notes, is_whole = self.history.notes(), self.history.kept == len(self.history)
+        poses = self._finder.move_all(notes["local"])
         if self._place is None:  # in a known map that frame is the map's
-            poses = self.frame.to_map_all(poses, answers.anchor, is_whole)
+            poses = self.frame.to_map_all(poses, notes["anchor"], is_whole)
         submaps = self._finder.submaps(len(poses))
         if self._place is not None and self._place.frame.is_shifted:
             poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
-        return Placement(poses, submaps)
+        return poses, submaps
 
     def keep_map(self) -> KeptMap | None:
         """The part of a known map that an extended one keeps, as of now; None: no such map."""
@@ -201,7 +205,7 @@ class OnlineSlam:
         points, T_local_base = self.odometry.end_points(hits, prior)
         weights = self.labels.label_ends(points, self.frame.T_map_local @ T_local_base)
         if self.odometry.crowd.walks_along:
-            weights = self.labels.doubt_ends(weights)
+            weights = self.labels.doubt(weights, of_ends=True)
         return dataclasses.replace(hits, weights=weights)
 
     def _judge(self, registered: Registration) -> None:
@@ -214,19 +218,15 @@ class OnlineSlam:
         elif not registered.is_contradicted:
             self._finder.agree(len(self.history))
 
-    def _observe(self, beams: ScanBeams, hits: Any) -> Observation:
+    def _observe(self, beams: ScanBeams, hits: Any, T: Float) -> Observation:
         """The observation by which a scan updates the labels."""
         margin = None
         if isinstance(hits, PlanarHits):
-            margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
-        return Observation(beams, margin, self.frame.tag)
+            margin = find_margins(beams, hits, self._selector.select(beams))
+        return Observation(beams, T, margin, self.frame.tag)
 
     def _add_to_maps(
-        self,
-        beams: ScanBeams,
-        labelled: LabelledScan,
-        e: NDArray[np.float32],
-        registered: Registration,
+        self, observation: Observation, e: NDArray[np.float32], registered: Registration
     ) -> MappedScan | None:
         """Add a scan to the local map and, if it is spaced, to the pose graph, and go on correcting
         the map; the scan if it is spaced."""
@@ -234,11 +234,11 @@ class OnlineSlam:
         # without odometry nothing else says how the robot moves
         is_doubted = registered.has_odometry and self.odometry.crowd.is_dense
         recent = self.labels.doubt(e) if is_doubted else e
-        added = self.odometry.add(beams, e, recent, self._label_again)
+        added = self.odometry.add(observation.beams, e, recent, self._label_again)
         if not self._finder.is_carried:
             if added is not None:
                 self.frame.add(added, registered)
-            agrees = None if registered.is_contradicted else labelled
+            agrees = None if registered.is_contradicted else observation
             self.frame.correct(agrees, added, self.labels, self.odometry)
         if self.dimension == 3 and self._finder.tie(self.frame, self.labels):
             self._path_begin = 0
@@ -260,15 +260,16 @@ class OnlineSlam:
         T, motion = place
         self._path_begin = frame.last + 1 if self._place is not None else 0
         self._movers.move(T)
-        pose = self.known_frame.to_map(motion @ update.pose)
-        return dataclasses.replace(
+        T_map_odom = update.T_map_odom
+        found = dataclasses.replace(
             update,
-            pose=pose,
+            pose=motion @ update.pose,
             covariance=rotate_covariance(update.covariance, motion),
-            T_map_odom=self._to_map_odom(pose),
+            T_map_odom=None if T_map_odom is None else motion @ T_map_odom,
             doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
-            movers=self._find_movers(),
+            movers=self._movers.movers(frame.T_map_local),
         )
+        return dataclasses.replace(self._in_map_frame(found), changes=update.changes)
 
     def _to_update(
         self, stamp_ns: int, registered: Registration, p_static: NDArray[np.float32]
@@ -281,48 +282,54 @@ class OnlineSlam:
             "lost": self._finder.is_lost,
             "ambiguous": self._finder.is_ambiguous,
         }
-        pose = self.known_frame.to_map(self.frame.T_map_local @ registered.T)
-        return Update(
+        T, T_odom_base = self.frame.T_map_local, self._T_odom_base
+        pose = T @ registered.T
+        update = Update(
             pose,
-            rotate_covariance(registered.covariance, self.frame.T_map_local),
+            rotate_covariance(registered.covariance, T),
             p_static,
-            self._to_map_odom(pose),
+            None if T_odom_base is None else pose @ se2.inverse(T_odom_base),
             tuple(name for name, is_so in doubts.items() if is_so),
-            self._take_changes(stamp_ns),
-            self._find_movers(),
-            [
-                LaterLabels(n, self.label(beams, n))
-                for n, beams in self._hindsight.take(stamp_ns)
-                if n < self.history.kept
+            self.labels.take_changes(stamp_ns),
+            self._movers.movers(T),
+            list(self._label_recent(stamp_ns)),
+        )
+        return self._in_map_frame(update)
+
+    def _label_recent(self, stamp_ns: int) -> Iterator[LaterLabels]:
+        """Labels of the scans that are old enough now, and have none of later yet."""
+        while self._recent and stamp_ns - self._recent[0][1].stamp_ns >= (self._lag_ns or 0):
+            number, beams = self._recent.popleft()
+            if number < self.history.kept:
+                yield LaterLabels(number, self.label(beams, number))
+
+    def _in_map_frame(self, update: Update) -> Update:
+        """An update whose poses are in the frame of the search in a known map."""
+        known, T = self.known_frame, update.T_map_odom
+        if not known.is_shifted:
+            return update
+        return dataclasses.replace(
+            update,
+            pose=known.to_map(update.pose),
+            T_map_odom=None if T is None else known.to_map(T),
+            changes=[
+                dataclasses.replace(change, first_cell=change.first_cell + self.cell_shift)
+                for change in update.changes
+            ],
+            movers=[
+                dataclasses.replace(mover, position=known.points_to_map(mover.position))
+                for mover in update.movers
             ],
         )
 
-    def _take_changes(self, stamp_ns: int) -> list[MapChange]:
-        """The parts of the map that changed, in the map frame."""
-        changes, known = self.labels.take_changes(stamp_ns), self.known_frame
-        if not known.is_shifted:
-            return changes
-        by = np.round(known.origin[: self.dimension] / self.resolution).astype(np.int64)
-        return [
-            dataclasses.replace(change, first_cell=change.first_cell + by) for change in changes
-        ]
-
-    def _find_movers(self) -> list[Mover]:
-        """Moving objects at present, in the map frame."""
-        movers, known = self._movers.movers(self.frame.T_map_local), self.known_frame
-        if not known.is_shifted:
-            return movers
-        return [
-            dataclasses.replace(mover, position=known.points_to_map(mover.position))
-            for mover in movers
-        ]
+    @property
+    def cell_shift(self) -> NDArray[np.int64]:
+        """(D,) by which the labels' cells are shifted in the map frame."""
+        shift = self.known_frame.origin[: self.dimension] / self.resolution
+        return np.asarray(np.round(shift), np.int64)
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
         """(D+1, D+1) of odometry since the last scan; None: not known."""
         if T_odom_base is None or self._T_odom_base is None:
             return None
         return np.asarray(se2.inverse(self._T_odom_base) @ T_odom_base)
-
-    def _to_map_odom(self, pose: Float) -> Float | None:
-        """(D+1, D+1) T_map_odom at the pose of the last scan; None: without odometry."""
-        return None if self._T_odom_base is None else pose @ se2.inverse(self._T_odom_base)

@@ -96,15 +96,7 @@ def replay(
 def iter_beams(recording: Recording) -> Iterator[ScanBeams]:
     """The scans of a recording, as they would arrive."""
     for t in recording.iter_scans(range(recording.n_scans)):
-        beams, sensor = recording.beams_of(t), int(recording.sensor[t])
-        yield ScanBeams(
-            int(recording.stamp_ns[t]),
-            np.array(recording.points[beams]),
-            np.array(recording.hit[beams]),
-            recording.T_base_sensor[sensor],
-            sensor,
-            None if recording.beam_time is None else np.array(recording.beam_time[beams]),
-        )
+        yield ScanBeams.of(recording, t)
 
 
 @contextmanager

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import empty, iter_blocks, release_pages, write_npy
+from stillmap.core.arrays import empty, write_npy
 from stillmap.core.errors import advise, cannot_write
 from stillmap.core.files import require_new, resolve_output
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.source import Source
 from stillmap.io.stillmap_folder import HEADER
 from stillmap.io.trajectory import write_tum
 from stillmap.live.history import FOLDER as RECORDING
-from stillmap.live.history import Answers, Placement
 from stillmap.live.known_map import KeptMap, write_extended
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import MappingResult, map_recording
@@ -48,32 +48,36 @@ def require_place_for_drive(output: Path, overwrite: bool) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot(ShortRepr):
-    """All scans so far and what is known of them, which stays while more scans are pushed.
+    """All T scans so far and what is known of them, which stays while more scans are pushed.
 
     Attributes:
         recording: the scans.
-        answers: to them, at the time.
-        placement: where they were taken.
+        given: (T, D+1, D+1) T_map_base as it was answered at the time.
+        p_static: (M,) float32 of the beams, likewise.
+        poses: (T, D+1, D+1) T_map_base as it is known now, in the frame of the submap.
+        submap: (T,) 0: the map. From 1 on: a submap that nothing ties to it, one for each time that
+            the robot was lost and not found. -1: the pose is not known.
         options: see Options.
         folder: of the recording, where it has one.
         kept_map: what is kept of the known map that is extended; None: there is none.
     """
 
     recording: Recording
-    answers: Answers
-    placement: Placement
+    given: NDArray[np.float64]
+    p_static: NDArray[np.float32]
+    poses: NDArray[np.float64]
+    submap: NDArray[np.int64]
     options: Options
     folder: Path | None = None
     kept_map: KeptMap | None = None
 
     def build(self, progress: Progress = no_progress) -> Result:
         """Labels, map and objects of the scans that are in the map, at these poses."""
-        main, _ = _find_submaps(self.placement)
-        return Result.of(self._build(self.recording, main, progress)[0])
+        return Result.of(self._take(self._find_submaps()[0])._map(progress))
 
     def refine(self, progress: Progress = no_progress) -> Result:
         """The result of `stillmap.build` on all scans: poses, too."""
-        return Result.of(self._map(self.recording, None, progress))
+        return Result.of(self._map(progress, refine=True))
 
     def save(
         self,
@@ -103,59 +107,93 @@ class Snapshot(ShortRepr):
             raise
 
     def _save(self, path: Path, overwrite: bool, progress: Progress) -> None:
-        main, others = _find_submaps(self.placement)
+        main, others = self._find_submaps()
         warnings = self._describe_lost(len(others), main)
         for text in warnings:
             _log.warning(text)
         kept_map = self.kept_map if main == 0 else None
         noted, details = self.recording.source, dict(self.recording.source.details)
-        plain = replace(self.recording, source=replace(noted, warnings=[]))
         if warnings:
-            details["lost_scans"] = int(np.count_nonzero(self.placement.submap))
+            details["lost_scans"] = int(np.count_nonzero(self.submap))
         if kept_map is not None and kept_map.cloud is not None:
             details[EXTENDS] = True
         source = replace(noted, warnings=[*noted.warnings, *warnings], details=details)
-        result, answers = self._build(replace(self.recording, source=source), main, progress)
-        submaps = [self._build(plain, number, no_progress) for number in others]
+        taken = self._take(main, source)
+        result = taken._map(progress)
+        submaps = [self._take(number, replace(noted, warnings=[])) for number in others]
+        maps = [submap._map() for submap in submaps]
         path = resolve_output(path)
         is_inside = self.folder is not None and self.folder.resolve() == path / RECORDING
 
         def write_more(folder: Path) -> None:
-            _write_answers(answers, result.recording.stamp_ns, folder)
+            taken._write_answers(folder)
             if kept_map is not None:
                 write_extended(folder, kept_map, result.map, result.options.output.map_mode)
-            for number, (submap, given) in enumerate(submaps, 1):
+            for number, (submap, of_submap) in enumerate(zip(submaps, maps, strict=True), 1):
                 inside = folder / SUBMAPS / str(number)
                 inside.parent.mkdir(exist_ok=True)
-                save(submap, inside)
-                _write_answers(given, submap.recording.stamp_ns, inside)
+                save(of_submap, inside)
+                submap._write_answers(inside)
             if is_inside:
                 shutil.copytree(path / RECORDING, folder / RECORDING, copy_function=_link)
 
-        if not is_inside:
-            save(result, path, overwrite, write_more=write_more)
-            return
-        # the folder holds the drive already, and perhaps an earlier result of it
-        save(result, path, True, marker=_DRIVE, write_more=write_more)
+        # the folder may hold the drive already, and perhaps an earlier result of it
+        more = {"overwrite": True, "marker": _DRIVE} if is_inside else {"overwrite": overwrite}
+        save(result, path, write_more=write_more, **more)
 
-    def _build(
-        self, recording: Recording, submap: int, progress: Progress
-    ) -> tuple[MappingResult, Answers]:
-        """The result of the scans of a submap, and the answers to them."""
-        scans = np.flatnonzero(self.placement.submap == submap)
-        taken, given = _take_scans(recording, self.answers, scans)
-        return self._map(taken, self.placement.poses[scans], progress), given
+    def _find_submaps(self) -> tuple[int, list[int]]:
+        """Number of the map, or of the largest submap, if no scan is in the map; and of the others
+        that are large enough for a map of their own."""
+        counts = np.bincount(self.submap[self.submap >= 0])
+        main = 0 if not len(counts) or counts[0] else int(np.argmax(counts))
+        large = np.flatnonzero(counts >= _MIN_SCANS).tolist()
+        return main, [number for number in large if number != main]
 
-    def _map(
-        self, recording: Recording, poses: NDArray[np.float64] | None, progress: Progress
-    ) -> MappingResult:
+    def _take(self, submap: int, source: Source | None = None) -> "Snapshot":
+        """The scans of a submap; `source` instead of that of the recording."""
+        scans, recording = np.flatnonzero(self.submap == submap), self.recording
+        if source is not None:
+            recording = replace(recording, source=source)
+        if len(scans) == recording.n_scans:
+            return replace(self, recording=recording)
+        counts = np.diff(recording.offset)[scans]
+        offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)])
+
+        def take(array: NDArray[Any]) -> NDArray[Any]:
+            out = empty((int(offset[-1]), *array.shape[1:]), array.dtype, recording.scratch)
+            for number, scan in enumerate(recording.iter_scans(scans.tolist(), array, out)):
+                out[offset[number] : offset[number + 1]] = array[recording.beams_of(scan)]
+            return out
+
+        times, odometry = recording.beam_time, recording.T_odom_base
+        taken = replace(
+            recording,
+            stamp_ns=recording.stamp_ns[scans],
+            offset=offset,
+            points=take(recording.points),
+            hit=take(recording.hit),
+            sensor=recording.sensor[scans],
+            T_odom_base=None if odometry is None else odometry[scans],
+            beam_time=None if times is None else take(times),
+        )
+        return replace(
+            self,
+            recording=taken,
+            given=self.given[scans],
+            p_static=take(self.p_static),
+            poses=self.poses[scans],
+            submap=self.submap[scans],
+        )
+
+    def _map(self, progress: Progress = no_progress, *, refine: bool = False) -> MappingResult:
+        poses, scratch = None if refine else self.poses, self.recording.scratch
         return map_recording(
-            recording, self.options, poses=poses, progress=progress, scratch=recording.scratch
+            self.recording, self.options, poses=poses, progress=progress, scratch=scratch
         )
 
     def _describe_lost(self, submaps: int, main: int) -> list[str]:
         """Warnings about scans whose pose in the map is unknown."""
-        lost, stamp_ns = np.flatnonzero(self.placement.submap), self.recording.stamp_ns
+        lost, stamp_ns = np.flatnonzero(self.submap), self.recording.stamp_ns
         if not len(lost):
             return []
         if main:
@@ -171,58 +209,11 @@ class Snapshot(ShortRepr):
             return [text]
         return [advise(text, f"see their own map{'s' * (submaps > 1)} in {SUBMAPS}")]
 
-
-def _find_submaps(placement: Placement) -> tuple[int, list[int]]:
-    """Number of the map, or of the largest submap, if no scan is in the map; and of the others that
-    are large enough for a map of their own."""
-    counts = np.bincount(placement.submap[placement.submap >= 0])
-    main = 0 if not len(counts) or counts[0] else int(np.argmax(counts))
-    large = np.flatnonzero(counts >= _MIN_SCANS).tolist()
-    return main, [number for number in large if number != main]
-
-
-def _take_scans(
-    recording: Recording, answers: Answers, scans: NDArray[np.intp]
-) -> tuple[Recording, Answers]:
-    """A recording of some of the scans (n,), rising, and the answers to them."""
-    if len(scans) == recording.n_scans:
-        return recording, answers
-    runs = np.split(scans, np.flatnonzero(np.diff(scans) > 1) + 1) if len(scans) else []
-    spans = [slice(recording.offset[run[0]], recording.offset[run[-1] + 1]) for run in runs]
-    counts = np.diff(recording.offset)[scans]
-    offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)])
-
-    def take(array: NDArray[Any]) -> NDArray[Any]:
-        out = empty((int(offset[-1]), *array.shape[1:]), array.dtype, recording.scratch)
-        first = 0
-        for span in spans:
-            part = array[span]
-            for block in iter_blocks(part):
-                out[first + block.start : first + block.stop] = part[block]
-                release_pages(out)
-            first += len(part)
-        return out
-
-    times, odometry = recording.beam_time, recording.T_odom_base
-    taken = replace(
-        recording,
-        stamp_ns=recording.stamp_ns[scans],
-        offset=offset,
-        points=take(recording.points),
-        hit=take(recording.hit),
-        sensor=recording.sensor[scans],
-        T_odom_base=None if odometry is None else odometry[scans],
-        beam_time=None if times is None else take(times),
-    )
-    poses, local, anchor = answers.poses[scans], answers.local[scans], answers.anchor[scans]
-    return taken, Answers(poses, local, anchor, take(answers.p_static))
-
-
-def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) -> None:
-    inside = folder / FOLDER
-    (inside / "beams").mkdir(parents=True)
-    write_tum(inside / "trajectory.tum", stamp_ns, answers.poses)
-    write_npy(inside / "beams/p_static.npy", answers.p_static)
+    def _write_answers(self, folder: Path) -> None:
+        inside = folder / FOLDER
+        (inside / "beams").mkdir(parents=True)
+        write_tum(inside / "trajectory.tum", self.recording.stamp_ns, self.given)
+        write_npy(inside / "beams/p_static.npy", self.p_static)
 
 
 def _link(source: str, target: str) -> None:

@@ -1,4 +1,5 @@
-"""Scans as they arrive: what users push, and the plain arrays that everything else works on."""
+"""Scans as they arrive: what users push, the plain arrays that everything else works on, and what
+of them updates the labels."""
 
 # signatures name ArrayLike instead of spelling it out
 from __future__ import annotations
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.arrays import finite_rows
+from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.from_arrays import (
@@ -23,13 +25,17 @@ from stillmap.io.from_arrays import (
 from stillmap.io.rigid_transforms import MAX_MOUNT
 from stillmap.prepare.max_range import MAX_ZERO_RANGE
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
+from stillmap.slam import scan_hits
 
 Float = NDArray[np.float64]
 
 # m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves
 # with the robot
 _COVER_DISTANCE, _COVER_SHARE = 0.3, 0.9
-_MAY_COVER = 1.01 * _COVER_DISTANCE**2  # m2
+# scans of a planar laser in a time bin in which each beam is followed; in others only its end
+# counts
+_FOLLOWED, _MAX_STRIDE, _RATE_GAIN = 3.0, 8, 0.1
+_MARGIN, _MAX_MARGIN = 0.1, 1.0  # m behind a surface where a beam has passed it; at grazing angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +93,20 @@ class ScanBeams(ShortRepr):
     sensor: str | int = 0
     beam_time: NDArray[np.float32] | None = None
 
+    @classmethod
+    def of(cls, recording: Recording, number: int, name: str | int | None = None) -> ScanBeams:
+        """A scan of a recording, copied; `name` of its sensor, None: the recording's number."""
+        beams, sensor = recording.beams_of(number), int(recording.sensor[number])
+        times = recording.beam_time
+        return cls(
+            int(recording.stamp_ns[number]),
+            np.array(recording.points[beams]),
+            np.array(recording.hit[beams]),
+            recording.T_base_sensor[sensor],
+            sensor if name is None else name,
+            None if times is None else np.array(times[beams]),
+        )
+
     @property
     def dimension(self) -> int:
         """2 or 3."""
@@ -117,12 +137,8 @@ def to_beams(scan: Scan) -> ScanBeams:
 
 def drop_cover(beams: ScanBeams) -> ScanBeams:
     """The beams of a scan; none of them usable if something covers the sensor."""
-    squared = np.einsum("nd,nd->n", beams.points, beams.points)
-    near, usable = squared < _MAY_COVER, squared < np.inf
-    if near.sum() < _COVER_SHARE * usable.sum():  # nearly all scans; what follows takes longer
-        return beams
-    usable = finite_rows(beams.points)
-    near = np.linalg.norm(beams.points[usable], axis=1) < _COVER_DISTANCE
+    usable = beams.points[finite_rows(beams.points)]
+    near = np.linalg.norm(usable, axis=1) < _COVER_DISTANCE
     if np.count_nonzero(near) < max(_COVER_SHARE * len(near), 1.0):
         return beams
     nothing = np.full_like(beams.points, np.nan)
@@ -197,3 +213,68 @@ def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
     if not np.hypot.reduce(out[:dimension, dimension]) <= MAX_MOUNT:
         raise ValueError(f"sensor_pose: expected at most {MAX_MOUNT:.0f} m from the robot's base")
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Observation(ShortRepr):
+    """A scan as the labels take it.
+
+    Attributes:
+        beams: of the scan, as if all had been taken at its stamp.
+        T: (D+1, D+1) pose of the base in the frame of the odometry by scans.
+        margin: (N,) float32, m before the end of each beam that it has not passed; inf: only its
+            end counts. In 3D None: it follows from the beams around.
+        tag: number of the keyframe by which cells move when the map is corrected.
+    """
+
+    beams: ScanBeams
+    T: Float
+    margin: NDArray[np.float32] | None
+    tag: int = 0
+
+
+class BeamSelector:
+    """Selects the beams of planar scans that are followed: fast sensors see the same several times
+    in a time bin.
+
+    Args:
+        bin_seconds: length of a time bin.
+    """
+
+    def __init__(self, bin_seconds: float) -> None:
+        self._bin_ns = 1e9 * bin_seconds
+        # of each sensor: running mean of ns between its scans, their number, the last stamp
+        self._rates = dict[str | int, tuple[float, int, int]]()
+
+    def select(self, beams: ScanBeams) -> NDArray[np.bool_]:
+        """(N,) beams to follow, others in every scan."""
+        period_ns, count, last_ns = self._rates.get(beams.sensor, (np.inf, 0, 0))
+        step = float(beams.stamp_ns - last_ns)
+        if count == 1:
+            period_ns = step
+        elif count > 1:
+            period_ns += _RATE_GAIN * (step - period_ns)
+        self._rates[beams.sensor] = period_ns, count + 1, beams.stamp_ns
+        stride = int(np.clip(self._bin_ns / (_FOLLOWED * max(period_ns, 1.0)), 1, _MAX_STRIDE))
+        return np.asarray((np.arange(len(beams.points)) + count + 1) % stride == 0)
+
+
+def find_margins(
+    beams: ScanBeams, hits: scan_hits.Scan, followed: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(N,) margins of the beams of a planar scan, see `Observation`.
+
+    Args:
+        beams: of the scan.
+        hits: of it in the base frame; a normal of 0: unknown.
+        followed: (N,) beams that show free space.
+    """
+    every = np.zeros(beams.points.shape)  # normals in the sensor frame; 0 where nothing was hit
+    every[beams.hit] = hits.normals @ beams.T_base_sensor[:2, :2]  # rotated back
+    margin, normals = np.full(len(beams.points), np.inf, np.float32), every[followed]
+    points = np.where(beams.hit[followed, None], beams.points[followed], 0.0)
+    length = np.maximum(np.linalg.norm(points, axis=1), 1e-6)
+    cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
+    cos[(normals[:, 0] == 0.0) & (normals[:, 1] == 0.0)] = 1.0
+    margin[followed] = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
+    return margin

@@ -1,18 +1,17 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan
-from stillmap.live.observation import select_hits, thin
-from stillmap.live.odometry_faults import OdometryFaults, is_plausible
+from stillmap.live.odometry_faults import DeadReckoning, Fault, OdometryFaults, is_plausible
 from stillmap.live.scan import ScanBeams, deskew
-from stillmap.slam import motion_model, relocalization
+from stillmap.slam import motion_model, relocalization, scan_hits
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.heading_alignment import DirectionDensity, Directions, HeadingOffset
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
@@ -30,6 +29,7 @@ from stillmap.slam.scan_matching import (
 
 Float = NDArray[np.float64]
 
+_MAX_REGISTERED = 600  # end points of a scan that are registered
 _KERNEL = np.radians(1.0)  # std of the normals about the direction of a wall
 _MIN_TRAVEL = 8.0  # m after which directions are known
 # normals of one wall share their errors: evidence of each; std of a building's walls about its
@@ -42,6 +42,19 @@ _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
 # of them that a scan outweighs which agrees, and one that says nothing; share of the usual
 # explained one below which nothing of a scan is in the local map, though the robot moved on
 _AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
+
+
+def select_hits(beams: ScanBeams) -> Scan:
+    """The hits of a scan in the base frame with weight 1, and the normals of their surfaces."""
+    points = scan_hits.transform_points(beams.points[beams.hit], beams.T_base_sensor)
+    return scan_hits.make_scan(points, np.ones(len(points), np.float32), beams.T_base_sensor)
+
+
+def thin(hits: Scan) -> Scan:
+    """Hits for registration: more than so many say no more."""
+    every = slice(None, None, max(-(-len(hits.points) // _MAX_REGISTERED), 1))
+    names = ("points", "weights", "normals", "isotropy")
+    return replace(hits, **{n: np.ascontiguousarray(getattr(hits, n)[every]) for n in names})
 
 
 class WallDirections:
@@ -104,8 +117,6 @@ class ScanOdometry:
         self._walls: WallDirections | None = WallDirections()
         self._is_first = True
         self._faults = OdometryFaults(options.odometry)
-        self._guessed_of = (self._pose, self._before, self._velocity_noise)
-        self._guessed = motion_model.constant_velocity_prior(*self._guessed_of)
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> MotionPrior:
         """The prior of the next scan, see `OdometryFaults.predict`.
@@ -116,8 +127,8 @@ class ScanOdometry:
         """
         if self._is_first:
             return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
-        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
-        return self._faults.predict(self._pose, self._guess(), increment, beams.stamp_ns, seconds)
+        ns, seconds = beams.stamp_ns, self._seconds_to(beams)
+        return self._faults.predict(self._pose, self._guess(), increment, ns, seconds)
 
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
         """The hits of a scan with weight 1, without the motion that is predicted during it.
@@ -146,13 +157,18 @@ class ScanOdometry:
         scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams)
         usual = self._usual.get(beams.sensor, 0.0)
         guess, learned = self._guess(), self._learned_prior(prior, increment)
-        match, is_slipping, is_carried = self._match(beams, scan, prior, learned, usual)
-        if not self._is_first and not is_carried:
-            match, has_fault = self._detect_fault(beams, scan, (prior, guess), match)
-            if has_fault:
+        match, is_slipping = self._match(beams, scan, prior, learned, usual)
+        is_carried = self._contradictions >= _CARRIED_AFTER
+        if is_carried:
+            self._start_anew()
+            match, is_slipping = accept_prior(prior), False
+        elif not self._is_first:
+            fault = self._detect_fault(beams, scan, (prior, guess), match)
+            if fault is not None:
+                self._pose, match = fault.before, fault.match
                 learned = self._learned_prior(prior, increment)  # the last pose has changed
             is_rejected = increment is not None and not prior.is_odometry
-            is_slipping = is_slipping or has_fault or is_rejected
+            is_slipping = is_slipping or fault is not None or is_rejected
         if not is_carried:
             match = self._correct_heading(scan, match)
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0 or self._is_adrift
@@ -190,7 +206,7 @@ class ScanOdometry:
         self.local_map.tend(beams.stamp_ns, self.travelled, label, most)
         return scan if added else None
 
-    def enter(self, local_map: LocalMap, T: Float) -> None:
+    def enter(self, local_map: Any, T: Float) -> None:
         """Go on in another map, in whose frame the frame so far has the pose T (3, 3)."""
         self.local_map = local_map
         self._pose, self._before = T @ self._pose, T @ self._before
@@ -198,7 +214,7 @@ class ScanOdometry:
         self._reckoning.reset()
         self._walls = None  # that map has the heading
 
-    def correct(self, local_map: LocalMap, motion: Float) -> None:
+    def correct(self, local_map: Any, motion: Float) -> None:
         """Go on with a local map made anew, after the map has moved (3, 3)."""
         if self.left_behind is self.local_map:  # nothing was: its memory is free
             self.left_behind = local_map
@@ -225,55 +241,46 @@ class ScanOdometry:
         prior: MotionPrior,
         learned: MotionPrior | None,
         usual: float,
-    ) -> tuple[ScanMatch, bool, bool]:
-        """The match, whether odometry slips, and whether the robot was carried elsewhere."""
+    ) -> tuple[ScanMatch, bool]:
+        """The match, and whether odometry slips."""
         self._is_adrift = False
         if not self.local_map.has_sensor(beams.sensor) or not len(scan.points):
-            return accept_prior(learned or prior), False, False
+            return accept_prior(learned or prior), False
         grid = self.local_map.grid
         if self._reckoning.is_far and prior.is_odometry:
-            return self._find_again(scan, learned or prior, usual)
+            return self._find_again(scan, learned or prior, usual), False
         match = match_scan(grid, scan, prior, usual, learned)
         if not is_poor(match, usual):
             self._weigh_evidence(Evidence.AGREES)
-            return match, match.contradicts_odometry, False
+            return match, match.contradicts_odometry
         guess = self._guess() if prior.is_odometry else None
         wider = widen_match(grid, scan, prior, guess, match, usual)
         # after a scan that contradicted the map, a poor one is where a place only looks alike
         is_sure = not (self._contradictions and is_poor(wider, usual))
-        if wider.widened and is_sure and self._is_reachable(beams, wider.T_map_base):
-            is_slipping = prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
-            return wider, is_slipping, False
+        step = se2.inverse(self._pose) @ wider.T_map_base
+        if wider.widened and is_sure and is_plausible(step, self._seconds_to(beams)):
+            return wider, prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
         evidence = relocalization.judge_scan(grid, scan, match, usual)
         if match.explained < _NOTHING * usual:
             evidence = Evidence.CONTRADICTS
         self._weigh_evidence(evidence)
-        if self._contradictions >= _CARRIED_AFTER:
-            self._start_anew()
-            return accept_prior(prior), False, True
-        return match, match.contradicts_odometry, False
+        return match, match.contradicts_odometry
 
-    def _find_again(
-        self, scan: Scan, prior: MotionPrior, usual: float
-    ) -> tuple[ScanMatch, bool, bool]:
-        """As of `_match`, after a stretch in which no scan met anything."""
+    def _find_again(self, scan: Scan, prior: MotionPrior, usual: float) -> ScanMatch:
+        """The match after a stretch in which no scan met anything."""
         grid = self.local_map.grid
         match, evidence = self._reckoning.search(grid, scan, prior, self._pose, usual)
         if match is not None:
             # it was there before, too: the step is that of odometry
             self._pose = match.T_map_base @ se2.inverse(prior.T_map_base) @ self._pose
             self._contradictions = 0.0
-            return match, False, False
+            return match
         self._is_adrift = not self._reckoning.is_over
         if not self._is_adrift:  # from here on scans are added to the map again
             self._contradictions = 0.0
         if evidence is Evidence.CONTRADICTS:
             self._weigh_evidence(evidence)
-        if self._contradictions >= _CARRIED_AFTER:
-            self._start_anew()
-            self._is_adrift = False
-            return accept_prior(prior), False, True
-        return accept_prior(prior), False, False
+        return accept_prior(prior)
 
     def _detect_fault(
         self,
@@ -281,8 +288,8 @@ class ScanOdometry:
         scan: Scan,
         priors: tuple[MotionPrior, MotionPrior],
         match: ScanMatch,
-    ) -> tuple[ScanMatch, bool]:
-        """The match without odometry where that is at fault, and whether it is."""
+    ) -> Fault | None:
+        """What is wrong with odometry; scans since then are removed from the local map."""
         has_map = self.local_map.has_sensor(beams.sensor) and not self._contradictions
         may_be_people = self.crowd.walks_along or self.crowd.may_walk_along
         usual = self._usual.get(beams.sensor) if has_map else None
@@ -290,12 +297,9 @@ class ScanOdometry:
         fault = self._faults.detect(
             grid, scan, self._pose, priors, match, ns, usual, may_stand=not may_be_people
         )
-        if fault is None:
-            return match, False
-        if fault.first_ns is not None:
+        if fault is not None and fault.first_ns is not None:
             self.local_map.remove_since(fault.first_ns)
-        self._pose = fault.before
-        return fault.match, True
+        return fault
 
     def _weigh_evidence(self, evidence: Evidence) -> None:
         """Count scans that contradict the local map, less those that agree."""
@@ -308,7 +312,7 @@ class ScanOdometry:
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, LocalMap(self.options.resolution)
         self._usual.clear()
-        self._contradictions = 0.0
+        self._contradictions, self._is_adrift = 0.0, False
         self._walls = WallDirections()
         self._faults.reset()
         self._reckoning.reset()
@@ -323,25 +327,21 @@ class ScanOdometry:
 
     def _guess(self) -> MotionPrior:
         """Constant velocity from the last two poses."""
-        of = (self._pose, self._before, self._velocity_noise)
-        if any(new is not old for new, old in zip(of, self._guessed_of, strict=True)):
-            self._guessed_of = of
-            self._guessed = motion_model.constant_velocity_prior(*of)
-        return self._guessed
+        return motion_model.constant_velocity_prior(self._pose, self._before, self._velocity_noise)
+
+    def _seconds_to(self, beams: ScanBeams) -> float:
+        """From the last scan."""
+        return 1e-9 * (beams.stamp_ns - self._stamp_ns)
 
     def _twist_to(self, T: Float, beams: ScanBeams) -> Float:
         """(3,) m/s and rad/s from the last pose to that of a scan; 0 for a leap, and where all
         beams have the stamp of the scan."""
-        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
+        seconds = self._seconds_to(beams)
         if self._is_first or seconds <= 0.0 or beams.beam_time is None:
             return np.zeros(3)
         twist: Float = se2.log((se2.inverse(self._pose) @ T)[None])[0] / seconds
         is_leap = np.hypot(*twist[:2]) > MAX_SPEED or abs(twist[2]) > MAX_TURN_RATE
         return np.zeros(3) if is_leap else twist
-
-    def _is_reachable(self, beams: ScanBeams, T: Float) -> bool:
-        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
-        return is_plausible(se2.inverse(self._pose) @ T, seconds)
 
     def _learn(
         self, beams: ScanBeams, learned: MotionPrior, match: ScanMatch, usual: float
@@ -360,7 +360,7 @@ class ScanOdometry:
 
     def _advance(self, beams: ScanBeams, T: Float) -> None:
         if not self._is_first:
-            seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
+            seconds = self._seconds_to(beams)
             self._seconds = seconds if self._seconds == 0.0 else 0.9 * self._seconds + 0.1 * seconds
             self.travelled += float(np.hypot(*(T[:2, 2] - self._pose[:2, 2])))
             self._before = self._pose

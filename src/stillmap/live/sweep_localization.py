@@ -1,17 +1,17 @@
 """Global localization in 3D: the planar search proposes poses, which the last sweep refines and
 verifies."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
-from stillmap.live.global_localization import GlobalLocalizer, Localization
-from stillmap.live.known_cloud import KnownCloud, KnownPlanes, KnownVoxels
-from stillmap.live.known_map import KeptMap, KnownMap, overlay
+from stillmap.live.global_localization import GlobalLocalizer, Localizer
+from stillmap.live.known_cloud import KnownCloud, KnownPlanes
+from stillmap.live.known_map import LOG_RATIO, KeptMap, KnownMap, overlay
 from stillmap.live.local_map import MappedScan
-from stillmap.live.place import Localizer
 from stillmap.live.sweep_view import SweepView, project_obstacles
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam import lidar_odometry
@@ -38,8 +38,7 @@ class SweepLocalizer(Localizer):
     """
 
     def __init__(self, known: KnownCloud, extends: bool, options: Options, threads: int) -> None:
-        super().__init__(known.planar, extends)
-        output = options.output
+        self.frame, self._extends, output = known.planar.frame, extends, options.output
         self._known, self._threads = known, threads
         self._band = output.min_obstacle_height, output.max_obstacle_height
         self._edge = resolve_resolution(options, 3).slam.resolution
@@ -81,15 +80,14 @@ class SweepLocalizer(Localizer):
             self._planar = GlobalLocalizer(extended, gone_weight=_GONE_WEIGHT)
         labels.filter = labels.filter.sibling()
 
-    def make_local_map(self) -> KnownPlanes:
+    def make_local_map(self, _local_map: Any, _T: Float) -> KnownPlanes:
         """The map that sweeps are registered to: one and the same."""
         return self._local_map
 
     def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
         if self._left is not None:
             return self._left
-        assert isinstance(empty, _core.SweepFilter3D)
-        self._voxels.prime(empty)
+        empty.prime(*self._voxels, LOG_RATIO)
         return empty
 
     def keep(self, labels: CausalLabels) -> KeptMap:
@@ -99,7 +97,8 @@ class SweepLocalizer(Localizer):
         now = labels.known_cells(self._left if self.is_lost else None)
         return self._known.keep(now, _p_unseen(labels), self._edge, self._band)
 
-    def _search(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> Localization:
+    def localize(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> Float | None:
+        """Search what was seen since the robot was lost, with the last sweep."""
         beams, in_plane = scan.beams, se2.project_to_plane(pose[None])[0]
         dense, _ = lidar_odometry.make_sweep(
             beams.points, beams.hit, scan.e, None, beams.T_base_sensor
@@ -113,15 +112,14 @@ class SweepLocalizer(Localizer):
             registered = se2.project_to_plane(self._register(thin, T @ in_plane)[None])[0]
             return np.asarray(registered @ se2.inverse(in_plane))
 
-        localization = self._planar.search(self._view.draw(labels), refine)
-        if localization.T is None:
-            return localization
-        T_map_base = self._register(sweep, localization.T @ in_plane)
+        T = self._planar.search(self._view.draw(labels), refine)
+        self.is_ambiguous = self._planar.is_ambiguous
+        if T is None:
+            return None
+        T_map_base = self._register(sweep, T @ in_plane)
         points = sweep.points.astype(np.float64)
         overlap = plane_overlap(points, self._seen, pose, self._local_map.planes, T_map_base)
-        if overlap < MIN_PLANE_OVERLAP:
-            return Localization(None)
-        return Localization(T_map_base @ se2.inverse(pose))
+        return None if overlap < MIN_PLANE_OVERLAP else T_map_base @ se2.inverse(pose)
 
     def _register(self, sweep: Sweep, in_plane: Float) -> Float:
         """(4, 4) T_map_base of a sweep at a planar pose (3, 3) of the robot."""
@@ -148,6 +146,5 @@ class SweepLocalizer(Localizer):
 def _p_unseen(labels: CausalLabels) -> float:
     """P(static and occupied) of a voxel of which only the known map speaks."""
     empty = labels.filter.sibling()
-    assert isinstance(empty, _core.SweepFilter3D)
-    KnownVoxels(np.zeros((1, 3), np.int64), np.ones(1, np.bool_)).prime(empty)
+    empty.prime(np.zeros((1, 3), np.int64), np.ones(1, np.bool_), LOG_RATIO)
     return float(labels.known_cells(empty).p_occupied[0])

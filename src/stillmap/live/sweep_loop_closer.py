@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.local_map import MappedScan, SpacedScans, SpacedView
+from stillmap.live.local_map import MappedScan, SpacedScans
 from stillmap.live.loop_closer import Correction
 from stillmap.slam import loop_closure
 from stillmap.slam.lidar_odometry import LidarOdometry
-from stillmap.slam.loop_closure_3d import MAX_CHI2, SEARCH_DISTANCE, LoopSearch, SweepLoopCloser
+from stillmap.slam.loop_closure_3d import MAX_CHI2, LoopSearch, SweepLoopCloser
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.types import LoopClosure
+from stillmap.slam.types import LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
 View = NDArray[np.float32]
@@ -60,7 +60,7 @@ def view_from_above(points: NDArray[np.floating]) -> View:
     return (out / max(float(np.linalg.norm(out)), 1e-9)).astype(np.float32)
 
 
-def find_alike(view: View, earlier: NDArray[np.float32], count: int) -> list[Candidate]:
+def find_alike(view: View, earlier: View, count: int) -> list[Candidate]:
     """The sweeps that look most alike, best first, turned as they fit best.
 
     Args:
@@ -91,74 +91,72 @@ class LiveSweepLoopCloser:
     """
 
     def __init__(self, options: SlamOptions, folder: Path | None, threads: int) -> None:
-        self._options, self._threads = options, threads
-        self._scans = SpacedScans(3, folder)
+        self._is_enabled, self._threads = options.loop_closure, threads
+        self._scans = SpacedScans(3, options, folder)
         self._found: list[LoopClosure] = []
         self._search = LoopSearch(0)
         self._searched = 0
-        self._from_above = list[NDArray[np.float32]]()  # views of the first keyframes
+        self._from_above = list[View]()  # views of the first keyframes
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
         """Add a keyframe at its pose in the frame of the odometry by scans; drift: infinite if the
         robot was carried before it, else not used."""
-        self._scans.append(scan, explained, drift)
+        self._scans.add(scan, explained, drift)
 
     def poll(self) -> Correction | None:
         """Search loops of the keyframes since the last search; None: nothing changed."""
-        if not self._options.loop_closure or self._searched == len(self._scans):
+        first, last = self._searched, len(self._scans)
+        if not self._is_enabled or first == last:
             return None
-        view, first = self._scans.view(), self._searched
-        closer, last = self._closer(view), len(view.poses)
+        context = self._scans.context(np.arange(last))
+        # the first keyframes after the robot was carried
+        carried = np.flatnonzero(np.isinf(context.drift[:, 0, 0])).tolist()
+        closer = self._closer(context, carried)
         search, self._searched = self._search, last
         search.corrected = np.concatenate([search.corrected, np.zeros((last - first, 4, 4))])
-        attempted = [self._search_keyframe(closer, view, k) for k in range(first, last)]
+        attempted = [self._search_keyframe(closer, context, carried, k) for k in range(first, last)]
         new = [closure for closure in attempted if closure is not None]
         self._found += new
         if all(closure.rejected for closure in new):
             return None
-        carried = _find_carried(view)
         chain = [
             replace(step, covariance=_ANYWHERE) if step.second in carried else step
             for step in closer.odometry_constraints()
         ]
         corrected, self._found = loop_closure.solve_graph(
-            closer.keyframes, chain, view.poses, self._found, MAX_CHI2
+            closer.keyframes, chain, context.poses, self._found, MAX_CHI2
         )
         search.corrected = corrected.copy()
-        search.correction = corrected[-1] @ se2.inverse(view.poses[-1])
+        search.correction = corrected[-1] @ se2.inverse(context.poses[-1])
         untied = _find_untied(carried, self._found)
         return Correction(search.correction, corrected, [], untied)
 
     def _search_keyframe(
-        self, closer: SweepLoopCloser, view: SpacedView, k: int
+        self, closer: SweepLoopCloser, context: LoopContext, carried: list[int], k: int
     ) -> LoopClosure | None:
         """The closure of keyframe k with an earlier one: with one that looks alike, as long as it
         is not known where the robot was carried."""
-        first = max((keyframe for keyframe in _find_carried(view) if keyframe <= k), default=0)
+        first, search = max((one for one in carried if one <= k), default=0), self._search
         known = (closure for closure in self._found if closure.earlier < first <= closure.later)
         if not first or any(not closure.rejected for closure in known):
-            return closer.search_keyframe(k, self._search)
-        search = self._search
-        search.corrected[k] = search.correction @ view.poses[k]
-        for candidate in find_alike(self._view(view, k), self._views(view, first), _MAX_ALIKE):
+            return closer.search_keyframe(k, search)
+        search.corrected[k] = search.correction @ context.poses[k]
+        for number in range(len(self._from_above), first):
+            self._from_above.append(self._view(context, number))
+        earlier = np.array(self._from_above[:first])
+        for candidate in find_alike(self._view(context, k), earlier, _MAX_ALIKE):
             T = np.eye(4)
             T[:2, :2] = se2.matrix(0.0, 0.0, candidate.yaw)[:2, :2]
             closure = closer.verify(candidate.number, k, T, *_ALIKE_STD)
             if not closure.rejected:
                 search.corrected[k] = search.corrected[candidate.number] @ closure.T
-                search.correction = search.corrected[k] @ se2.inverse(view.poses[k])
+                search.correction = search.corrected[k] @ se2.inverse(context.poses[k])
                 search.since = float(closer.travelled[k])
                 return closure
         return None
 
-    def _views(self, view: SpacedView, count: int) -> NDArray[np.float32]:
-        """(K, R, S) views from above of the first keyframes."""
-        for k in range(len(self._from_above), count):
-            self._from_above.append(self._view(view, k))
-        return np.array(self._from_above[:count])
-
-    def _view(self, view: SpacedView, k: int) -> NDArray[np.float32]:
-        scan = self._scans.scan(view, k)
+    def _view(self, context: LoopContext, k: int) -> View:
+        scan = self._scans.scan(context, k)
         use = scan.beams.hit & (scan.e >= _STATIC)
         points, T = scan.beams.points[use], scan.beams.T_base_sensor
         return view_from_above(points @ T[:3, :3].T + T[:3, 3])
@@ -167,35 +165,29 @@ class LiveSweepLoopCloser:
         """Remove temporary files."""
         self._scans.close()
 
-    def _closer(self, view: SpacedView) -> SweepLoopCloser:
-        n = len(view.poses)
-        odometry = LidarOdometry(view.poses, np.zeros((n, 6)), np.zeros((n, 6, 6)), view.explained)
-        search = self._options.loop_search_distance
+    def _closer(self, context: LoopContext, carried: list[int]) -> SweepLoopCloser:
+        n, poses = len(context.poses), context.poses
+        odometry = LidarOdometry(poses, np.zeros((n, 6)), np.zeros((n, 6, 6)), context.explained)
+        # loops lead back to all from before, in a wide window; and no submap has both places
+        apart = _CARRIED_TRAVEL * np.cumsum(np.isin(context.keyframes, carried))
         return SweepLoopCloser(
-            view.recording,
-            view.e,
+            context.recording,
+            context.e,
             odometry,
-            # loops lead back to all from before, in a wide window; and no submap has both places
-            view.travelled
-            + _CARRIED_TRAVEL * np.cumsum(np.isin(np.arange(n), _find_carried(view))),
-            np.arange(n),
-            SEARCH_DISTANCE if search is None else search,
+            context.travelled + apart,
+            context.keyframes,
+            context.search_distance,
             self._threads,
         )
 
 
-def _find_carried(view: SpacedView) -> list[int]:
-    """The first keyframes after the robot was carried."""
-    return [int(k) for k in np.flatnonzero(np.isinf(view.drift[:, 0, 0]))]
-
-
 def _find_untied(carried: Sequence[int], closures: Sequence[LoopClosure]) -> tuple[int, ...]:
-    """Those of them whose stretch no loops tie to the first one, nor to others that are."""
+    """The first keyframes after the robot was carried whose stretch no loops tie to the first one,
+    nor to others that are."""
     accepted = [closure for closure in closures if not closure.rejected]
-    ends = np.array([(closure.earlier, closure.later) for closure in accepted], np.int64).reshape(
-        -1, 2
-    )
-    stretches = np.searchsorted(carried, ends, side="right")  # 0: before the first time
+    ends = np.array([(closure.earlier, closure.later) for closure in accepted], np.int64)
+    # 0: before the first time
+    stretches = np.searchsorted(carried, ends.reshape(-1, 2), side="right")
     counts = Counter((int(a), int(b)) for a, b in stretches if a != b)
     loops = [pair for pair, count in counts.items() if count >= _MIN_LOOPS]
     tied = {0}

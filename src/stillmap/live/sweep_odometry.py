@@ -1,5 +1,7 @@
 """Causal scan matching in 3D: each sweep is registered to a map of the sweeps before it."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -149,14 +151,14 @@ class SweepOdometry:
             self._cropped_at = here.copy()
             self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
 
-    def enter(self, known: KnownPlanes, T: Float) -> None:
+    def enter(self, known: Any, T: Float) -> None:
         """Go on in a known map, in whose frame the frame so far has the pose T (4, 4)."""
         self.local_map, self._known, self._knows_first = known.planes, known, True
         state, covariance = self._state, self._state.covariance.copy()
         covariance[:6, :6] += np.diag(np.square(np.repeat(_FOUND_STD, 3)))
         self._state = State(T @ state.T_map_base, state.twist, covariance)
 
-    def correct(self, _local_map: None, _motion: Float) -> None:
+    def correct(self, _local_map: Any, _motion: Float) -> None:
         """The local map stays as it is: it holds what is near, not what loops tie to it."""
 
     def _advance(self, state: State, stamp_ns: int) -> None:

@@ -116,7 +116,7 @@ class SweepView:
         """The view, in the frame of the labels; NaN: unknown."""
         assert self._ground is not None
         edge = labels.resolution
-        near = self._select_near(labels.seen_cells(), edge)
+        near = self._select_near(labels.known_cells(is_seen_alone=True), edge)
         columns = project_cells(near, self._ground, self._band, edge)
         return _draw([(self._free, 0.0), (columns.cells, columns.p_occupied)], edge)
 
