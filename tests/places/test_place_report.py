@@ -7,6 +7,7 @@ import io
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from small_place import RECORD, make_place
 from stillmap.cli.main import main
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import MapView
-from stillmap.results.report.place import place_marks, render_place_report
+from stillmap.results.report.place import place_mark, render_place_report
 from stillmap.results.timeline import read_timeline
 from stillmap.sim import Scene, simulate, write_simulation
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
@@ -155,18 +156,18 @@ def _daily(names):
     ]
 
 
-def test_labels_do_not_cover_each_other(place):
-    timeline = read_timeline(place)
-    changes = [timeline.changes[k] for k in (0, 2, 3)]
-    marks = place_marks(changes, MapView((-4.0, -3.0, 4.0, 3.0), (800, 600)))
-    low = np.array([(one.x, one.y - marks.font_size) for one in marks.marks])
-    high = low + np.array([2 * marks.font_size, marks.font_size])
-    for a in range(3):
-        for b in range(a):
-            apart = (high[a] <= low[b]) | (high[b] <= low[a])
-            assert apart.any()
-        assert (low[a] > 0).all()
-        assert (high[a] < [800, 600]).all()
+def test_marks_are_around_what_changed(place):
+    view = MapView((-4.0, -3.0, 4.0, 3.0), (800, 600))
+    marks = [place_mark(one, view) for one in read_timeline(place).changes]
+    assert [one["label"] for one in marks] == ["A0", "M1", "D2", "G3"]
+    assert marks[0]["centers"] == [pytest.approx((340.0, 180.0))]
+    assert marks[1]["centers"] == [pytest.approx((680.0, 120.0)), pytest.approx((620.0, 180.0))]
+    assert marks[0]["boxes"][0] == pytest.approx((315.0, 155.0, 50.0, 50.0))
+    assert marks[0]["text"][0] > 365.0
+    far = replace(read_timeline(place).changes[0], box=(3.5, 0.0, 3.9, 0.4))
+    x, _, is_before = place_mark(far, view)["text"]
+    assert is_before
+    assert x < 750.0
 
 
 @pytest.fixture(scope="session")

@@ -12,14 +12,14 @@ from recordings import of_one_sensor
 
 from stillmap.results.colors import ORANGE
 from stillmap.results.report.page import render_report
-from stillmap.results.report.point_view import draw_points_3d, find_ceiling, look_at, points_data
+from stillmap.results.report.point_view import draw_points_3d, find_ceiling, points_data
 
 WHITE, RED = (255, 255, 255), (255, 0, 0)
 
 
 def ahead(points, colors):
     """Drawn by a camera at the origin that looks along y."""
-    T = look_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    T = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
     picture = draw_points_3d(np.array(points, np.float32), np.array(colors, np.uint8), T)
     return np.asarray(picture)
 

@@ -168,30 +168,27 @@ def test_report_of_a_large_map_stays_small(result):
     Page(text)
 
 
-def test_curve_marks_the_best_and_spans_the_axes():
+def test_curve_spans_the_axes_and_has_gaps_where_values_are_not_finite():
     curve = curve_of([1, 2, 3], [-30.0, -20.0, -25.0], best=2)
-    left, top, right, bottom = curve.box
-    assert curve.best == curve.dots[1]
-    x, y = np.transpose(curve.dots)
+    left, top, right, bottom = curve["box"]
+    assert curve["best"] == curve["dots"][1]
+    x, y = np.transpose(curve["dots"])
     assert (np.diff(x) > 0).all()
     assert y.argmin() == 1
     assert left <= x.min() <= x.max() <= right
     assert top <= y.min() <= y.max() <= bottom
-    assert [label for _, label in curve.x_ticks] == ["1", "2", "3"]
-    ticks = np.array([float(label) for _, label in curve.y_ticks])
-    heights = np.array([height for height, _ in curve.y_ticks])
+    assert [label for _, label in curve["x_ticks"]] == ["1", "2", "3"]
+    heights, labels = zip(*curve["y_ticks"], strict=True)
     # ticks lie where their values would
-    np.testing.assert_allclose(np.interp(-25.0, ticks, heights), curve.dots[2][1], atol=0.2)
-
-
-def test_curve_has_gaps_where_values_are_not_finite():
+    at = np.interp(-25.0, [float(label) for label in labels], heights)
+    assert at == pytest.approx(curve["dots"][2][1], abs=0.2)
     values = [-4.0, -3.0, float("nan"), -2.0, float("-inf"), -1.5, -1.0]
     curve = curve_of(range(1, 8), values, best=3)
-    assert curve.best is None
-    assert len(curve.dots) == 5
-    assert [len(line.split()) for line in curve.lines] == [2, 2]
-    assert curve_of([1, 2], [float("nan")] * 2, best=1).dots == []
-    assert len(curve_of([1, 2], [-5e9, -5e9], best=1).y_ticks) > 1
+    assert curve["best"] is None
+    assert len(curve["dots"]) == 5
+    assert [len(line.split()) for line in curve["lines"]] == [2, 2]
+    assert curve_of([1, 2], [float("nan")] * 2, best=1)["dots"] == []
+    assert len(curve_of([1, 2], [-5e9, -5e9], best=1)["y_ticks"]) > 1
 
 
 def with_likelihoods(result, values):

@@ -3,7 +3,7 @@
 import base64
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -104,13 +104,11 @@ def map_window(maps: Sequence[GridMap]) -> Window:
     Without occupied cells: every known cell; without known cells: the whole first map, of a map
     without cells the place of one.
     """
-    for select in (_is_occupied, _is_known):
-        boxes = [box for box in (_box(one, select) for one in maps) if box is not None]
+    for least in (OCCUPIED_THRESH, -1.0):
+        boxes = [box for box in (_box(one, least) for one in maps) if box is not None]
         if boxes:
-            corners = np.array(boxes)
-            x0, y0 = corners[:, :2].min(axis=0).tolist()
-            x1, y1 = corners[:, 2:].max(axis=0).tolist()
-            return x0, y0, x1, y1
+            left, bottom, right, top = zip(*boxes, strict=True)
+            return min(left), min(bottom), max(right), max(top)
     x0, y0, x1, y1 = extent(maps[0])
     cell = maps[0].resolution
     return x0, y0, max(x1, x0 + cell), max(y1, y0 + cell)
@@ -152,25 +150,22 @@ def draw_thinly_observed(
     occupancy: GridMap, thin: NDArray[np.bool_], window: Window
 ) -> Image.Image:
     """Thinly observed cells (H, W) in violet, as a layer over the `draw_map` of the window."""
-    factor = reduction_factor(window, occupancy.resolution)
-    shown = np.concatenate(
-        [
-            _mostly(cells, ~np.isnan(p), factor)
-            for cells, p in zip(
-                iter_strips(occupancy, thin, window, False, factor),
-                iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor),
-                strict=True,
-            )
-        ]
-    )
-    return color_by_index(shown[::-1].astype(np.uint8), (UNKNOWN, VIOLET), bytes([0, VEIL_ALPHA]))
+    factor, strips = reduction_factor(window, occupancy.resolution), []
+    for cells, p in zip(
+        iter_strips(occupancy, thin, window, False, factor),
+        iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor),
+        strict=True,
+    ):
+        count, known = (count_in_squares(some, factor) for some in (cells, ~np.isnan(p)))
+        strips.append((count > 0) & (2 * count >= known))  # half or more of the known cells
+    shown = np.concatenate(strips)[::-1].astype(np.uint8)
+    return color_by_index(shown, (UNKNOWN, VIOLET), bytes([0, VEIL_ALPHA]))
 
 
 def draw_points(points: NDArray[np.float32] | NDArray[np.float64], view: MapView) -> Image.Image:
     """Orange dots on a transparent layer over the `draw_map` of a view."""
-    width, height = view.size
-    pixels = np.zeros((height, width), np.uint8)
-    _put_dots(pixels, view.to_pixels(points), 1, max(1, round(width / _DOT_WIDTH)))
+    pixels = np.zeros(view.size[::-1], np.uint8)
+    _put_dots(pixels, view, points, 1, max(1, round(view.size[0] / _DOT_WIDTH)))
     return color_by_index(pixels, (UNKNOWN, ORANGE), 0)
 
 
@@ -180,9 +175,8 @@ def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     levels = reduce_levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
     larger = max(1, _SNAPSHOT_PIXELS // max(levels.shape))
     pixels = levels.repeat(larger, axis=0).repeat(larger, axis=1)
-    height, width = pixels.shape
-    view = MapView(extent(snapshot), (width, height))
-    _put_dots(pixels, view.to_pixels(snapshot.dynamic_points), _ORANGE_INDEX, 3)
+    view = MapView(extent(snapshot), (pixels.shape[1], pixels.shape[0]))
+    _put_dots(pixels, view, snapshot.dynamic_points, _ORANGE_INDEX, 3)
     return color_levels(pixels)
 
 
@@ -204,35 +198,25 @@ def color_by_index(
     return image
 
 
-def _is_occupied(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
-    return np.asarray(p_occupied > OCCUPIED_THRESH)
-
-
-def _is_known(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
-    return np.asarray(~np.isnan(p_occupied))
-
-
-def _box(occupancy: GridMap, select: Callable[[NDArray[np.float32]], Mask]) -> Window | None:
-    """The window around the selected cells, with a margin of 4 cells and 1/20 of its length."""
+def _box(occupancy: GridMap, least: float) -> Window | None:
+    """The window around the cells with more, with a margin of 4 cells and 1/20 of its length."""
     rows, columns = (np.zeros(n, bool) for n in occupancy.p_occupied.shape)
     for (at_rows, at_columns), p_occupied in tiles_of(occupancy.p_occupied):
-        cells = select(p_occupied)
+        cells = p_occupied > least  # false where it is unknown
         rows[at_rows] |= cells.any(axis=1)
         columns[at_columns] |= cells.any(axis=0)
     if not rows.any():
         return None
-    x, y, _, _ = extent(occupancy)
+    x, y = extent(occupancy)[:2]
     left, right, bottom, top = (
         int(n) for some in (columns, rows) for n in np.flatnonzero(some)[[0, -1]]
     )
     shorter, longer = sorted((right - left, top - bottom))
     margin = 4 + min(longer // 20, _MAX_MARGIN + 5 * shorter)
-    return (
-        x + (left - margin) * occupancy.resolution,
-        y + (bottom - margin) * occupancy.resolution,
-        x + (right + 1 + margin) * occupancy.resolution,
-        y + (top + 1 + margin) * occupancy.resolution,
-    )
+    low, high = np.array([left, bottom]) - margin, np.array([right, top]) + 1 + margin
+    x0, y0 = (occupancy.resolution * low + (x, y)).tolist()
+    x1, y1 = (occupancy.resolution * high + (x, y)).tolist()
+    return x0, y0, x1, y1
 
 
 def reduction_factor(window: Window, resolution: float, max_pixels: int = MAX_PIXELS) -> int:
@@ -255,12 +239,6 @@ def iter_strips(
         cells, _ = cut_layer(occupancy, layer, (x0, bottom, x1, top), outside)
         yield np.ascontiguousarray(cells)
         release(layer)
-
-
-def _mostly(cells: Mask, among: Mask, factor: int) -> Mask:
-    """Squares of `factor` x `factor` cells of which half or more of the cells `among` are true."""
-    count = count_in_squares(cells, factor)
-    return np.asarray((count > 0) & (2 * count >= count_in_squares(among, factor)))
 
 
 def count_in_squares(cells: Mask, factor: int) -> NDArray[np.int64]:
@@ -296,13 +274,12 @@ def color_levels(levels: NDArray[np.uint8], *colors: Color) -> Image.Image:
 
 
 def _put_dots(
-    pixels: NDArray[np.uint8], centers: NDArray[np.float64], value: int, size: int
+    pixels: NDArray[np.uint8], view: MapView, points: NDArray[Any], value: int, size: int
 ) -> None:
-    """Squares of `size` pixels around (K, 2) columns and rows."""
+    """Squares of `size` pixels around map points (K, 2) in m."""
     height, width = pixels.shape
-    j, i = np.floor(centers).astype(np.int64).T
-    for di in range(size):
-        for dj in range(size):
-            y, x = i + di - size // 2, j + dj - size // 2
-            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-            pixels[y[inside], x[inside]] = value
+    offset = np.arange(size) - size // 2
+    j, i = np.floor(view.to_pixels(points)).astype(np.int64).T[:, :, None] + offset
+    x, y = np.broadcast_arrays(j[:, None, :], i[:, :, None])
+    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+    pixels[y[inside], x[inside]] = value

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
@@ -35,6 +34,16 @@ from stillmap.results.run_json import known_area
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # pixels of map.pgm
 _MAX_EDGE = 4096  # pixels; a trinary map of that size takes a few hundred kB as PNG
+# of occupancy in percent as `--map-mode scale` writes it, and of unknown cells
+_PERCENT_GREYS = [round(255 * (1 - percent / 100)) for percent in range(UNKNOWN_LEVEL)] + [UNKNOWN]
+_MAX_PATH_POINTS = 3000
+_MAX_ROWS = 50
+_COLORS = {
+    "came": (20, 120, 60),
+    "left": (190, 40, 120),
+    "comes and goes": (40, 90, 200),
+    "door": (200, 120, 20),
+}
 
 
 class WrittenMap(NamedTuple):
@@ -68,10 +77,6 @@ def draw_written_map(occupancy: GridMap, mode: MapMode) -> WrittenMap:
     return WrittenMap(color_by_index(pixels, ((grey,) * 3 for grey in greys)), window, factor)
 
 
-# of occupancy in percent as `--map-mode scale` writes it, and of unknown cells
-_PERCENT_GREYS = [round(255 * (1 - percent / 100)) for percent in range(UNKNOWN_LEVEL)] + [UNKNOWN]
-
-
 def _reduce_states(p_occupied: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     """0: a cell of the square is occupied, 2: at least half of its known cells are free, else 1."""
     states = trinary_pixels(p_occupied)
@@ -83,16 +88,6 @@ def _reduce_states(p_occupied: NDArray[np.float32], factor: int) -> NDArray[np.u
         occupied = count_in_squares(occupied, factor) > 0
         free = (n_free > 0) & (2 * n_free >= n_known)
     return np.where(occupied, 0, np.where(free, 2, 1)).astype(np.uint8)
-
-
-_MAX_PATH_POINTS = 3000
-_MAX_ROWS = 50
-_COLORS = {
-    "came": (20, 120, 60),
-    "left": (190, 40, 120),
-    "comes and goes": (40, 90, 200),
-    "door": (200, 120, 20),
-}
 
 
 class MapFigure(NamedTuple):
@@ -121,10 +116,7 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
         return None
     view = filtered.view
     ends = sample_dynamic_points(result.deskewed, result.poses, result.p_static)[:, :2]
-    poses = result.poses
-    if result.recording.dimension == 3:
-        poses = se2.project_to_plane(poses)
-    every = max(1, math.ceil(len(poses) / _MAX_PATH_POINTS))
+    every = max(1, math.ceil(len(result.poses) / _MAX_PATH_POINTS))
     area = known_area(result)
     return {
         **written_map_data(result.map, result.options.output.map_mode, view),
@@ -134,7 +126,7 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
         "thinly_observed": data_uri(
             draw_thinly_observed(result.map, result.evidence.thinly_observed, view.window)
         ),
-        "path": view.svg_points(poses[::every, :2, -1]),
+        "path": view.svg_points(result.poses[::every, :2, -1]),
         "known_area": area["known"],
         "thinly_observed_area": area["thin"],
         "min_observations": result.evidence.min_observations,
@@ -145,8 +137,7 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
 def written_map_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
     """A map, its picture as written placed in percent of a view, and the bounds of both in m."""
     written = draw_written_map(occupancy, mode)
-    x0, y0, x1, y1 = view.window
-    left, bottom, right, top = written.window
+    (x0, y0, x1, y1), (left, bottom, right, top) = view.window, written.window
     width, height = x1 - x0, y1 - y0
     return {
         "view": view,
@@ -204,10 +195,9 @@ def _change_row(change: Change, start_ns: int) -> dict[str, Any]:
 def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
     """The changed cells in the colors of their kinds, transparent elsewhere."""
     codes: Any = changed_cells(result.map, result.changes)  # may be tiled
-    factor = view.factor
     strips = [
-        reduce_squares(np.maximum, cells, factor)
-        for cells in iter_strips(result.map, codes, view.window, 0, factor)
+        reduce_squares(np.maximum, cells, view.factor)
+        for cells in iter_strips(result.map, codes, view.window, 0, view.factor)
     ]
     colors = ((255, 255, 255), *(_COLORS[kind] for kind in CHANGED))
     return color_by_index(np.concatenate(strips)[::-1], colors, 0)

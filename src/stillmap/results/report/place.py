@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,7 @@ from stillmap.core.grid_map import GridMap
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import MapMode
 from stillmap.results.colors import KIND_COLORS, color_by_id
-from stillmap.results.report.figures import (
-    MapView,
-    data_uri,
-)
+from stillmap.results.report.figures import MapView, data_uri
 from stillmap.results.report.maps import written_map_data
 from stillmap.results.report.page import files_data
 from stillmap.results.report.place_pictures import PlacePictures
@@ -31,7 +28,6 @@ from stillmap.results.timeline import (
 )
 
 Float = NDArray[np.float64]
-Box = tuple[float, float, float, float]  # left, top, right, bottom
 
 _MAX_PATH_POINTS = 1000  # of a session
 _THUMBNAIL_PIXELS = 60_000  # 300 x 200, about 5 kB as PNG
@@ -50,8 +46,8 @@ _FILES = {
     "changes.npz": "the cells of every change",
     "states.npz": "changed cells and their states in every session",
 }
-_FONT_SHARE, _PAD_SHARE, _HEAD_SHARE = 1 / 45, 1 / 160, 1 / 60  # of the longer edge of the view
-_LETTER_WIDTH = 0.68  # of the size of the font
+_FONT_SHARE, _PAD_SHARE = 1 / 45, 1 / 160  # of the longer edge of the view
+_LABEL_SHARE = 0.06  # of the width, which a label takes at most
 
 
 def render_place_report(
@@ -86,20 +82,13 @@ def render_place_report(
 
 def _place_data(timeline: Timeline, record: Mapping[str, Any]) -> dict[str, Any]:
     """Headline figures."""
-    first, last = (
-        format_date_time(pick(getattr(one, f"{end}_ns") for one in timeline.sessions))
-        for pick, end in ((min, "first"), (max, "last"))
-    )
-    counts = record["counts"]
     return {
         "dimension": record["dimension"],
-        "first": first,
-        "last": last,
-        "counts": _count_kinds(timeline.changes),
+        "first": format_date_time(min(one.first_ns for one in timeline.sessions)),
+        "last": format_date_time(max(one.last_ns for one in timeline.sessions)),
+        "kinds": _count_kinds(timeline.changes),
         "changes": len(timeline.changes),
-        "scans": counts["scans"],
-        "hits": counts["hits"],
-        "dynamic": counts["dynamic"],
+        **{name: record["counts"][name] for name in ("scans", "hits", "dynamic")},
         "constraints": record["place"]["constraints"],
         "area": record["area"]["known"],
         "geometry": record["quality"]["geometry"],
@@ -127,7 +116,7 @@ def _map_data(
     return {
         **written_map_data(occupancy, mode, view),
         "image": data_uri(pictures.draw_map()),
-        "font_size": max(view.size) / 45,
+        "font_size": max(view.size) * _FONT_SHARE,
         "paths": [_path_data(folder, one, k, view) for k, one in enumerate(timeline.sessions)],
     }
 
@@ -143,9 +132,8 @@ def _path_data(folder: Path, one: PlaceSession, number: int, view: MapView) -> d
     }
 
 
-def _session_color(number: int) -> tuple[int, int, int]:
-    red, green, blue = color_by_id([number])[0].tolist()
-    return red, green, blue
+def _session_color(number: int) -> tuple[int, ...]:
+    return tuple(color_by_id([number])[0].tolist())
 
 
 def _session_data(timeline: Timeline, number: int) -> dict[str, Any]:
@@ -199,7 +187,7 @@ def _step_data(timeline: Timeline, number: int, pictures: "PlacePictures | None"
     }
     if pictures is not None and changes:
         patch = pictures.draw_difference(number)
-        data["marks"] = place_marks(listed, pictures.view)
+        data["marks"] = [place_mark(one, pictures.view) for one in listed]
         data["patch"] = (
             None if patch is None else (*patch[:2], *patch.image.size, data_uri(patch.image))
         )
@@ -224,104 +212,20 @@ def _change_row(change: SessionChange, timeline: Timeline) -> dict[str, Any]:
     }
 
 
-class Mark(NamedTuple):
-    """A change on the map.
-
-    Attributes:
-        kind: of the change.
-        label: letter and number.
-        box: `d` attribute of the box where it is, or was.
-        start: of the box where it was before it moved; empty otherwise.
-        arrow: of the line from there to here; empty otherwise.
-        x, y: left end of the label's base line.
-    """
-
-    kind: str
-    label: str
-    box: str
-    start: str
-    arrow: str
-    x: float
-    y: float
-
-
-class Marks(NamedTuple):
-    """Marks of several changes, and the size of the font of their labels in pixels."""
-
-    marks: list[Mark]
-    font_size: float
-
-
-def place_marks(changes: list[SessionChange], view: MapView) -> Marks:
-    """Marks of changes; labels avoid each other and the boxes where there is space."""
-    longest = max(view.size)
-    font, pad = longest * _FONT_SHARE, longest * _PAD_SHARE
-    boxes = [[_to_box(low, high, view, pad) for low, high in one.boxes] for one in changes]
-    taken = [box for of in boxes for box in of]
-    out = []
-    for change, of in zip(changes, boxes, strict=True):
-        width = _LETTER_WIDTH * font * len(change.label)
-        label = _find_space(of[0], (width, font), taken, view)
-        taken.append(label)
-        start = arrow = ""
-        if len(of) == 2:
-            start, arrow = _box_path(of[1]), _arrow_path(of[1], of[0], longest * _HEAD_SHARE)
-        x, y = label[0], label[3] - 0.15 * font
-        out.append(Mark(change.kind, change.label, _box_path(of[0]), start, arrow, x, y))
-    return Marks(out, font)
-
-
-def _to_box(low: Float, high: Float, view: MapView, pad: float) -> Box:
-    (left, bottom), (right, top) = view.to_pixels(np.stack([low[:2], high[:2]])).tolist()
-    return left - pad, top - pad, right + pad, bottom + pad
-
-
-def _box_path(box: Box) -> str:
-    left, top, right, bottom = box
-    return f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}Z"
-
-
-def _arrow_path(start: Box, end: Box, size: float) -> str:
-    """A line from the middle of a box to that of another one, with a head."""
-    a, b = (np.array([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]) for box in (start, end))
-    length = float(np.linalg.norm(b - a))
-    if length < 1e-6:
-        return ""
-    angle = math.atan2(b[1] - a[1], b[0] - a[0])
-    size = min(size, 0.6 * length)
-    head = [
-        b - size * np.array([math.cos(angle + turn), math.sin(angle + turn)])
-        for turn in (0.5, -0.5)
-    ]
-    points = [f"{x:.1f} {y:.1f}" for x, y in (a, b, *head)]
-    return f"M{points[0]}L{points[1]}M{points[2]}L{points[1]}L{points[3]}"
-
-
-def _find_space(box: Box, size: tuple[float, float], taken: list[Box], view: MapView) -> Box:
-    """Find the place beside a box where a label of a width and height covers least."""
-    width, height = size
-    left, top, right, bottom = box
-    gap = 0.2 * height
-    corners = [
-        (right + gap, top),
-        (left - gap - width, top),
-        (left, top - gap - height),
-        (left, bottom + gap),
-        (right + gap, bottom - height),
-        (left - gap - width, bottom - height),
-    ]
-
-    others = np.array(taken)
-
-    def cost(label: Box) -> float:
-        outside = -min(0.0, label[0], label[1], view.size[0] - label[2], view.size[1] - label[3])
-        return float(_overlap(np.array(label), others).sum()) + 1e3 * outside
-
-    return min(((x, y, x + width, y + height) for x, y in corners), key=cost)
-
-
-def _overlap(box: Float, others: Float) -> Float:
-    """(n,) areas that a box (4,) shares with others (n, 4)."""
-    sides = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
-    out: Float = np.maximum(sides, 0.0).prod(axis=1)
-    return out
+def place_mark(change: SessionChange, view: MapView) -> dict[str, Any]:
+    """A change on the map: its boxes as left, top, width and height in pixels, that where it is or
+    was first, and where its label begins, or ends where that is nearer to the border."""
+    pad, boxes = max(view.size) * _PAD_SHARE, []
+    for low, high in change.boxes:
+        (left, bottom), (right, top) = view.to_pixels(np.stack([low[:2], high[:2]])).tolist()
+        boxes.append((left - pad, top - pad, right - left + 2 * pad, bottom - top + 2 * pad))
+    left, top, width, _ = boxes[0]
+    is_before = left + width > (1.0 - _LABEL_SHARE) * view.size[0]
+    x = left - pad if is_before else left + width + pad
+    return {
+        "kind": change.kind,
+        "label": change.label,
+        "boxes": boxes,
+        "centers": [(x + 0.5 * w, y + 0.5 * h) for x, y, w, h in boxes],
+        "text": (x, top + max(view.size) * _FONT_SHARE, is_before),
+    }

@@ -19,7 +19,8 @@ Float = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 _SIZE = (1280, 720)  # pixels
-_FIELD_OF_VIEW = math.radians(45.0)
+_CENTER = 0.5 * np.array(_SIZE) - 0.5  # pixel centers have integer coordinates
+_FOCAL_LENGTH = 0.5 * _SIZE[0] / math.tan(math.radians(22.5))  # pixels
 _MAX_STATIC, _MAX_DYNAMIC = 1_000_000, 200_000  # points drawn
 _MAX_FITTED = 50_000  # points that choose the view
 _POINT_SIZE = 0.05  # m, nearer than where this is a pixel points cover 2 x 2 pixels
@@ -95,16 +96,16 @@ def find_ceiling(z: NDArray[np.float32], base: float) -> float:
 def draw_points_3d(points: Points, colors: NDArray[np.uint8], T_camera_map: Float) -> Image.Image:
     """Points (n, 3) in colors (n, 3) over a dark background; nearer ones hide those behind."""
     width, height = _SIZE
-    K = camera_matrix(_SIZE, _FIELD_OF_VIEW)
     local = points @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
     ahead = np.flatnonzero(local[:, 2] > 0.0)
     # far ones first, so that near ones are painted over them
     order = ahead[np.argsort(-local[ahead, 2], kind="stable")]
     z = local[order, 2]
     column, row = (
-        np.floor(local[order, k] / z * K[k, k] + K[k, 2] + 0.5).astype(np.int64) for k in (0, 1)
+        np.floor(local[order, k] / z * _FOCAL_LENGTH + _CENTER[k] + 0.5).astype(np.int64)
+        for k in (0, 1)
     )
-    large = z < _POINT_SIZE * K[0, 0]
+    large = z < _POINT_SIZE * _FOCAL_LENGTH
     pixels = np.empty((height, width, 3), np.uint8)
     pixels[:] = _BACKGROUND
     for down, right in ((1, 1), (1, 0), (0, 1), (0, 0)):
@@ -124,21 +125,10 @@ def _choose_view(points: Points) -> Float:
     x, y = (high - low)[:2].tolist()
     yaw = _TURN - (math.pi / 2 if x >= y else 0.0)
     direction = np.array([math.cos(yaw), math.sin(yaw), math.tan(_ELEVATION)])
-    K = camera_matrix(_SIZE, _FIELD_OF_VIEW)
-    return fit_camera(inside if len(inside) else some, direction, K, _SIZE)
+    return fit_camera(inside if len(inside) else some, direction)
 
 
-def camera_matrix(size: tuple[int, int], field_of_view: float) -> Float:
-    """K (3, 3) of a (width, height) image with a horizontal field of view in rad.
-
-    Pixel centers have integer coordinates.
-    """
-    width, height = size
-    f = 0.5 * width / math.tan(0.5 * field_of_view)
-    return np.array([[f, 0.0, 0.5 * width - 0.5], [0.0, f, 0.5 * height - 0.5], [0.0, 0.0, 1.0]])
-
-
-def fit_camera(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
+def fit_camera(points: Float, direction: Float) -> Float:
     """T_camera_map (4, 4) of the closest camera whose image contains all points (n, 3), centered.
 
     In camera axes, with s the slope of the edge of the field of view, a point (x, y, z) is inside
@@ -147,30 +137,18 @@ def fit_camera(points: Float, direction: Float, K: Float, size: tuple[int, int])
 
     Args:
         points: m.
-        direction: (3,) from the points towards the camera.
-        K: (3, 3) camera matrix.
-        size: width and height in pixels.
+        direction: (3,) from the points towards the camera, not vertical; z is up in the image.
     """
-    T = look_at(direction, np.zeros(3))
-    local = points @ T[:3, :3].T
-    slopes = 0.5 * np.array(size) / np.array([K[0, 0], K[1, 1]]) / _MARGIN
-    right = (local[:, :2] - slopes * local[:, 2:]).max(axis=0)
-    left = (-local[:, :2] - slopes * local[:, 2:]).max(axis=0)
-    z = min(float((-(left + right) / (2.0 * slopes)).min()), local[:, 2].min() - 2.0 * _NEAR)
-    eye = T[:3, :3].T @ np.array([*(0.5 * (right - left)), z])
-    return look_at(eye, eye - direction)
-
-
-def look_at(eye: Float, target: Float) -> Float:
-    """T_camera_map (4, 4) of a camera at `eye` (3,) that looks at `target` (3,).
-
-    Up in the image is z of the map, or y for a camera that looks straight down.
-    """
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(forward, up)
+    forward = -direction / np.linalg.norm(direction)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    local = points @ R.T
+    slopes = 0.5 * np.array(_SIZE) / _FOCAL_LENGTH / _MARGIN
+    most = (local[:, :2] - slopes * local[:, 2:]).max(axis=0)
+    least = (-local[:, :2] - slopes * local[:, 2:]).max(axis=0)
+    z = min(float((-(least + most) / (2.0 * slopes)).min()), local[:, 2].min() - 2.0 * _NEAR)
     T = np.eye(4)
-    T[:3, :3] = right, np.cross(forward, right), forward
-    T[:3, 3] = -T[:3, :3] @ eye
+    T[:3, :3] = R
+    T[:3, 3] = -np.array([*(0.5 * (most - least)), z])
     return T

@@ -4,22 +4,16 @@ import base64
 import functools
 import hashlib
 import math
-import os
-import sys
 from collections.abc import Mapping
-from importlib.util import cache_from_source
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.files import package_version
 
 if TYPE_CHECKING:
-    from jinja2 import BytecodeCache, Environment
+    from jinja2 import Environment
 
 _TEMPLATES = Path(__file__).parent / "templates"
-
-# entries of a recording's notes that are angles in rad
-_ANGLES = {"angle_step", "pitch", "roll", "start_angle", "theta", "yaw"}
 
 
 def render_page(data: Mapping[str, Any], template: str = "report.html.j2") -> str:
@@ -39,7 +33,6 @@ def _environment() -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        bytecode_cache=_bytecode_cache(),
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
@@ -48,23 +41,6 @@ def _environment() -> "Environment":
     )
     environment.filters.update(FILTERS)
     return environment
-
-
-def _bytecode_cache() -> "BytecodeCache | None":
-    """Compiled templates, kept where Python keeps its modules; None: Python keeps none either.
-
-    Compiling takes longer than rendering.
-    """
-    if sys.dont_write_bytecode:
-        return None
-    from jinja2 import FileSystemBytecodeCache
-
-    folder = Path(cache_from_source(str(_TEMPLATES / "report.py"))).parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return FileSystemBytecodeCache(str(folder)) if os.access(folder, os.W_OK) else None
 
 
 def format_share(share: float) -> str:
@@ -77,8 +53,8 @@ def format_share(share: float) -> str:
 
 def format_duration(seconds: float) -> str:
     """Seconds as ms, s, min or h."""
-    if 0 < seconds < 0.001:
-        return "under 1 ms"
+    if 0 < seconds < 0.1:
+        return f"{1e3 * seconds:.2g} ms"
     if seconds < 10:
         return f"{seconds:.2g} s"
     if seconds < 59.5:
@@ -87,14 +63,6 @@ def format_duration(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest} s"
     return f"{minutes // 60} h {minutes % 60} min"
-
-
-def format_milliseconds(seconds: float) -> str:
-    """Seconds in ms below 1 s, with two significant digits below 10 ms."""
-    if seconds >= 1:
-        return format_duration(seconds)
-    milliseconds = 1e3 * seconds
-    return f"{milliseconds:.0f} ms" if milliseconds >= 10 else f"{milliseconds:.2g} ms"
 
 
 def format_bytes(size: float) -> str:
@@ -124,12 +92,6 @@ def format_scalar(value: object) -> str:
     return f"{value:.7g}" if isinstance(value, float) else str(value)
 
 
-def format_quantity(value: object, name: str) -> str:
-    """A JSON scalar of that name; angles, in rad, become degrees."""
-    is_angle = isinstance(value, int | float) and name in _ANGLES
-    return f"{math.degrees(float(str(value))):.4g}°" if is_angle else format_scalar(value)
-
-
 def format_sentence(text: str) -> str:
     """A text with a full stop; the style sheet shows its first letter as a capital."""
     return text + "." * (text[-1:] not in ".?!")
@@ -138,12 +100,10 @@ def format_sentence(text: str) -> str:
 FILTERS = {
     "share": format_share,
     "duration": format_duration,
-    "milliseconds": format_milliseconds,
     "bytes": format_bytes,
     "number": format_number,
     "clock": format_clock,
     "scalar": format_scalar,
-    "quantity": format_quantity,
     "sentence": format_sentence,
     "comma": "{:,}".format,
 }
