@@ -114,7 +114,7 @@ def _convert_to_nav2(
     is_traffic = rule.keepout is not None or rule.slow is not None
     crossings = read_crossings(result.folder) if is_traffic else None
     maps = nav2.make_maps(read_grid(result.folder), drawn, rule, crossings)
-    nav2.write(maps, output, result.map_mode, overwrite=args.overwrite)
+    nav2.write(maps, output, result.options.output.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
         written.append(f"keep-out zones of {maps.keepout_area:.1f} m2")
@@ -193,12 +193,12 @@ def _convert_to_cloud(
     from stillmap.core.files import require_new_file
     from stillmap.results import point_cloud
     from stillmap.results.export import point_cloud_files
-    from stillmap.results.reader import TILTING, is_place
+    from stillmap.results.reader import EXTENDS, TILTING, is_place
 
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
     is_whole = isinstance(result.record.get(TILTING), dict) or is_place(result.folder)
-    if is_whole or result.extends_map:  # no recording has all of it
+    if is_whole or result.record["input"].get(EXTENDS) is True:  # no recording has all of it
         points = point_cloud.cloud_from_folder(result.folder, args.only)
     else:
         points = _build_cloud(args, result, workplace(output))
@@ -224,9 +224,15 @@ def _build_cloud(
             hint=f"{_PARQUET} holds the end points of its beams",
         )
     poses = result.read_poses(recording)
-    deskewed = deskew_recording(recording, poses, result.slam_options)
+    deskewed = deskew_recording(recording, poses, result.options.slam)
     colors = read_colors(result.folder, recording.n_beams)
-    deskewed = limit_hits(deskewed, poses, result.region)
+    deskewed = limit_hits(deskewed, poses, result.options.output.region)
     return point_cloud.cloud_from_recording(
-        recording, deskewed, poses, labels.p_static, args.only, colors, result.frame.origin
+        recording,
+        deskewed,
+        poses,
+        labels.p_static,
+        args.only,
+        colors,
+        result.read_frame().origin,
     )

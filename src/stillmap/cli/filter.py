@@ -155,7 +155,9 @@ def _find_target(result: "ResultFolder", output: Path, to: str | None) -> "Filte
         require_apart(output, path, result.folder)
     target = filter_writers.find_target(source if len(result.sources) == 1 else None, output, to)
     if target.writer is not None:
-        writers.require_fit(output, target.writer, result.dimension, result.n_sensors)
+        sensors = result.record["input"].get("sensors")
+        count = len(sensors) if isinstance(sensors, list) and sensors else 1
+        writers.require_fit(output, target.writer, result.dimension, count)
     return target
 
 
@@ -217,7 +219,7 @@ def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget
     poses = result.read_poses(recording)
     recording = result.calibrate(recording)
     if not target.marker:
-        recording = deskew_recording(recording, poses, result.slam_options)
+        recording = deskew_recording(recording, poses, result.options.slam)
     return dataclasses.replace(recording, T_recorded_base=poses)
 
 

@@ -310,7 +310,7 @@ def _free_runs(grid: Grid) -> tuple[Float, Float]:
 def _find_frame(source: str | os.PathLike[str] | GridMap, grid: GridMap) -> LocalFrame:
     """The frame in which a result was computed, with whose cells those of its map agree."""
     if not isinstance(source, GridMap) and (Path(source) / RECORD).is_file():
-        noted = ResultFolder(Path(source), read_run(Path(source))).frame
+        noted = ResultFolder(Path(source), read_run(Path(source))).read_frame()
         if noted.is_shifted:
             return noted
     return LocalFrame.near(se2.matrix(*grid.origin)[None])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
-from stillmap.core.arrays import iter_blocks, write_npy, write_npz
+from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
 from stillmap.core.files import package_version, write_text
@@ -19,7 +19,6 @@ from stillmap.core.json import write_json
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
-from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
@@ -51,7 +50,7 @@ from stillmap.places.store import (
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
-from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, read_labels
+from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, count_labels, read_labels
 from stillmap.results.report.place import render_place_report
 from stillmap.results.run_json import quality_record
 from stillmap.results.timeline import CHANGES, STATES, PlaceSession
@@ -200,7 +199,7 @@ def place_record(
     occupancy: OccupancyMap,
 ) -> dict[str, Any]:
     """The content of `run.json` of a place; `occupancy` is its map in its local frame."""
-    place = result.place
+    place, labels = result.place, read_labels(folder)
     origin = place.local_frame.origin
     known = int(np.count_nonzero(~np.isnan(np.asarray(occupancy.p_occupied))))
     return {
@@ -215,7 +214,7 @@ def place_record(
         **({LOCAL_ORIGIN: origin.tolist()} if origin.any() else {}),
         "options": to_dict(options),
         "iterations": [],
-        "counts": _count(folder),
+        "counts": {"scans": len(labels.stamp_ns), **count_labels(labels.hit, labels.p_static)},
         "area": {"known": round(known * place.resolution**2, 6)},
         "warnings": [
             f"{refusal.name} is not in the place: {refusal.why}" for refusal in result.refusals
@@ -230,25 +229,6 @@ def place_record(
             "constraints": len(place.ties),
             "changes": len(result.changes),
         },
-    }
-
-
-def _count(folder: Path) -> dict[str, int]:
-    """Scans, beams and hits of a place, and how many of the hits are dynamic."""
-    labels = read_labels(folder)
-    hit, p_static = labels.hit, labels.p_static
-    hits = dynamic = unusable = 0
-    for block in iter_blocks(hit, p_static):
-        hits += int(np.count_nonzero(hit[block]))
-        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
-        unusable += int(np.count_nonzero(np.isnan(p_static[block])))
-    return {
-        "scans": len(labels.stamp_ns),
-        "beams": len(hit),
-        "hits": hits,
-        "max_range": len(hit) - hits - unusable,
-        "unusable": unusable,
-        "dynamic": dynamic,
     }
 
 

@@ -34,7 +34,7 @@ from stillmap.places.store import (
     read_session,
     write_session,
 )
-from stillmap.results.folder import ResultFolder, open_result
+from stillmap.results.folder import open_result
 from stillmap.results.mapped_place import input_stem
 from stillmap.results.pose_graph_g2o import read_g2o
 from stillmap.results.reader import (
@@ -224,8 +224,7 @@ def _keep_session(
     if recording is None:
         deskewed = result.deskewed
     else:
-        slam_options = ResultFolder(mapped, result.run).slam_options
-        deskewed = deskew_recording(recording, result.poses, slam_options)
+        deskewed = deskew_recording(recording, result.poses, result.options.slam)
     session = to_session(source.name, result, deskewed, resolve_threads(options.threads))
     cell, p_static = cell_size(options, session.dimension), np.asarray(result.p_static)
     beams = find_beam_cells(deskewed, session.poses, p_static, session.graph, cell)
@@ -254,8 +253,8 @@ def to_session(name: str, result: Result, deskewed: Recording, threads: int) -> 
         InputError: its record or pose graph is damaged.
     """
     assert result.path is not None
-    record, output = ResultFolder(result.path, result.run), result.options.output
-    frame = record.frame if record.frame.is_shifted else LocalFrame.near(result.poses)
+    frame, output = result.loaded.read_frame(), result.options.output
+    frame = frame if frame.is_shifted else LocalFrame.near(result.poses)
     poses, graph = frame.to_local(result.poses), None
     if not (np.abs(poses) < MAX_DISTANCE).all():
         where = str(result.path / RECORD)

@@ -3,8 +3,9 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,22 +23,10 @@ from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.pipeline.options import MapMode, Options, OutputOptions
-from stillmap.pipeline.quality import Quality
+from stillmap.pipeline.options import Options
 from stillmap.prepare.options import ReadOptions
-from stillmap.results.reader import (
-    EXTENDS,
-    LOCAL_ORIGIN,
-    RECORD,
-    Labels,
-    is_result,
-    read_labels,
-    read_run,
-)
+from stillmap.results.reader import LOCAL_ORIGIN, RECORD, Labels, is_result, read_labels, read_run
 from stillmap.results.run_json import read_calibration
-from stillmap.slam import SlamOptions
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -61,14 +50,18 @@ class ResultFolder(ShortRepr):
         """Of the record."""
         return self.folder / RECORD
 
-    @property
+    @cached_property
     def options(self) -> Options:
-        """Every option as it was resolved for the map.
+        """Every option as it was resolved for the map; the default where the record has none.
 
         Raises:
             InputError: the record has options that this version does not know.
         """
-        return self._override(Options(), self.record.get("options") or {})
+        try:
+            return config.override(Options(), _drop_unset(self.record.get("options") or {}))
+        except InputError as error:
+            where = str(self.folder)
+            raise InputError(f"has options that cannot be: {error}", where=where) from error
 
     @property
     def read_options(self) -> ReadOptions:
@@ -77,38 +70,13 @@ class ResultFolder(ShortRepr):
         Raises:
             InputError: the record does not say so.
         """
-        read_as = self._section("read")
         if "read" not in (self.record.get("options") or {}):
             raise InputError("names no options", where=str(self.path))
-        return self._override(ReadOptions(), read_as)
+        return self.options.read
 
-    @property
-    def slam_options(self) -> SlamOptions:
-        """The options that deskew its recording as it was deskewed for the map."""
-        return SlamOptions(deskew=self._section("slam").get("deskew") is not False)
-
-    @property
-    def quality(self) -> Quality:
-        """Quality of the result; unknown where the record does not say so."""
-        return Quality(**(self.record.get("quality") or {}))
-
-    @property
-    def region(self) -> Region | None:
-        """The part of the map frame that it shows; None: everything."""
-        region = self._section("output").get("region")
-        return self._override(OutputOptions(), {"region": region}).region
-
-    @property
-    def frame(self) -> LocalFrame:
-        """The frame in which it was computed.
-
-        Raises:
-            InputError: the record has an origin that cannot be.
-        """
-        return self.read_frame(LOCAL_ORIGIN)
-
-    def read_frame(self, name: str) -> LocalFrame:
-        """The frame whose origin (3,) is the entry of a name; without one the map frame.
+    def read_frame(self, name: str = LOCAL_ORIGIN) -> LocalFrame:
+        """The frame whose origin (3,) is an entry of the record, in which it was computed unless
+        another one is named; without the entry the map frame.
 
         Raises:
             InputError: it is no place.
@@ -121,42 +89,12 @@ class ResultFolder(ShortRepr):
         return LocalFrame(np.array(origin))
 
     @property
-    def map_mode(self) -> MapMode:
-        """Mode of its map image; the default where the record does not say."""
-        mode = self._section("output").get("map_mode")
-        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
-
-    @property
     def dimension(self) -> int:
         """Dimension of its recording, 2 or 3."""
         noted = self.record.get("dimension")  # of a session of a place
         if noted in (2, 3):
             return int(noted)
         return 3 if (self.folder / "static.ply").is_file() else 2
-
-    @property
-    def extends_map(self) -> bool:
-        """True if its clouds hold what its recording does not show: it extends a known map."""
-        return self.record["input"].get(EXTENDS) is True
-
-    @property
-    def n_sensors(self) -> int:
-        """Number of sensors of its recording that the record lists, at least 1."""
-        sensors = self.record["input"].get("sensors")
-        return max(len(sensors), 1) if isinstance(sensors, list) else 1
-
-    def _section(self, name: str) -> dict[str, Any]:
-        """A section of the options in the record; empty where there is none."""
-        section = (self.record.get("options") or {}).get(name)
-        return section if isinstance(section, dict) else {}
-
-    def _override(self, options: T, changes: dict[str, Any]) -> T:
-        """The options with those of the record that are set."""
-        try:
-            return config.override(options, _drop_unset(changes))
-        except InputError as error:
-            where = str(self.folder)
-            raise InputError(f"has options that cannot be: {error}", where=where) from error
 
     def require_source(self) -> Path:
         """Path of the recording.
@@ -228,25 +166,18 @@ def match_labels(recording: Recording, labels: Labels, where: str) -> Recording:
     Raises:
         InputError: scans, beams or hits are others than those of the labels.
     """
-    other, left_out = "", False
-    if not np.array_equal(recording.stamp_ns, labels.stamp_ns) or not np.array_equal(
-        recording.offset, labels.offset
-    ):
-        other = "scans or beams"
-    else:
-        for b in arrays.iter_blocks(recording.hit, labels.hit):
-            odd = np.flatnonzero(recording.hit[b] != labels.hit[b])
-            left_out |= bool(len(odd))
-            if not (recording.hit[b][odd] & np.isnan(labels.p_static[b][odd])).all():
-                other = "beams hit something"
-    if other:
-        what = f"is not the recording that was mapped: other {other}"
+    is_same = np.array_equal(recording.stamp_ns, labels.stamp_ns)
+    is_same = is_same and np.array_equal(recording.offset, labels.offset)
+    left_out = False
+    for b in arrays.iter_blocks(recording.hit, labels.hit) if is_same else ():
+        odd = np.flatnonzero(recording.hit[b] != labels.hit[b])
+        left_out |= bool(len(odd))
+        is_same &= bool((recording.hit[b][odd] & np.isnan(labels.p_static[b][odd])).all())
+    if not is_same:
+        what = "is not the recording that was mapped: other scans, beams or hits"
         raise InputError(what, where=where, hint="name it with recording=PATH")
-    return _drop_unlabelled(recording, labels) if left_out else recording
-
-
-def _drop_unlabelled(recording: Recording, labels: Labels) -> Recording:
-    """The recording without the returns that have no label."""
+    if not left_out:
+        return recording
     points = arrays.copy(recording.points, recording.scratch)
     hit = arrays.copy(recording.hit, recording.scratch)
     for b in arrays.iter_blocks(points, hit):
@@ -286,7 +217,9 @@ def read_region(result: Path) -> Region | None:
     Raises:
         InputError: the record is damaged.
     """
-    return ResultFolder(result, read_run(result)).region if is_result(result) else None
+    if not is_result(result):
+        return None
+    return ResultFolder(result, read_run(result)).options.output.region
 
 
 def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:

@@ -133,7 +133,9 @@ class MappedPlace:
     @property
     def quality(self) -> Quality:
         """Of labels and geometry, from 0 to 100; None where it cannot be determined."""
-        return self.loaded.quality if self.mapping is None else self.mapping.quality
+        if self.mapping is not None:
+            return self.mapping.quality
+        return Quality(**(self.run.get("quality") or {}))
 
     @property
     def warnings(self) -> list[str]:
@@ -180,7 +182,7 @@ class MappedPlace:
         """The recording without the motion during its scans, computed at every call."""
         if self.mapping is not None:
             return self.mapping.deskewed
-        return deskew_recording(self.recording, self.poses, self.loaded.slam_options)
+        return deskew_recording(self.recording, self.poses, self.options.slam)
 
     @cached_property
     def colors(self) -> NDArray[np.uint8] | None:

@@ -1,7 +1,6 @@
 """Pictures of a result: matplotlib axes, and the summary that notebooks show by themselves."""
 
 import html
-import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -9,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError, import_extra
-from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.quality import Quality
 from stillmap.results.colors import KIND_COLORS
 from stillmap.results.mapped_place import MappedPlace
+from stillmap.results.reader import count_labels
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
 from stillmap.results.timeline import SessionChange
 
@@ -24,6 +22,7 @@ if TYPE_CHECKING:
 
 _BLUE, _ORANGE = "#1f6feb", "#f07800"
 _MAX_POINTS = 50_000  # dynamic returns in a figure
+_SPACE = "\N{NO-BREAK SPACE}"  # between thousands
 _PREVIEW_PIXELS = 420  # longest edge in a notebook
 
 
@@ -38,23 +37,29 @@ def plot_result(
     """See `Result.plot`; dynamic returns are those of the sessions `moving`."""
     if ax is None:
         ax = _make_axes()
-    window = map_window([result.map])
-    image = draw_map(result.map, window).convert("RGB")
-    ax.imshow(np.asarray(image), extent=_extent(result, image), interpolation="nearest")
+    view = MapView.of([result.map])
+    image, (x0, y0, x1, y1) = draw_map(result.map, view.window), view.window
+    # pixels are whole squares of cells: the last ones may reach beyond the window
+    width, height = (n * view.factor * result.map.resolution for n in image.size)
+    extent = (x0, x0 + width, y0, y0 + height)
+    ax.imshow(np.asarray(image.convert("RGB")), extent=extent, interpolation="nearest")
     placed = [one for one in result.sessions if one.accepted]
     for session in moving:
-        _draw_dynamic(session, ax)
-    if trajectory:
-        for one in placed:
-            x, y = _track(result)[one.scans].T
-            color = _BLUE if len(placed) == 1 else None
-            label = "trajectory" if len(placed) == 1 else one.name
-            ax.plot(x, y, color=color, linewidth=1.0, label=label)
+        points = sample_dynamic_points(
+            session.deskewed, session.poses, session.p_static, limit=_MAX_POINTS
+        )
+        x, y = points[:, :2].T
+        ax.plot(x, y, ".", color=_ORANGE, markersize=1.5, label="dynamic returns")
+    for one in placed if trajectory else []:
+        x, y = _track(result)[one.scans].T
+        color = _BLUE if len(placed) == 1 else None
+        label = "trajectory" if len(placed) == 1 else one.name
+        ax.plot(x, y, color=color, linewidth=1.0, label=label)
     if changes and result.changes:
         _draw_changes(result.changes, ax)
     ax.set_aspect("equal")
-    ax.set_xlim(window[0], window[2])
-    ax.set_ylim(window[1], window[3])
+    ax.set_xlim(x0, x1)
+    ax.set_ylim(y0, y1)
     ax.set_xlabel("x (m)")
     ax.set_ylabel("y (m)")
     return ax
@@ -77,14 +82,6 @@ def _make_axes() -> "Axes":
     return axes
 
 
-def _draw_dynamic(result: MappedPlace, ax: "Axes") -> None:
-    """Draw returns from what moves."""
-    points = sample_dynamic_points(
-        result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
-    )
-    ax.plot(points[:, 0], points[:, 1], ".", color=_ORANGE, markersize=1.5, label="dynamic returns")
-
-
 def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:
     """Draw a box around what changed, and an arrow from where it stood before."""
     patches = import_extra("matplotlib.patches", "a plot", "drawn", group="notebook")
@@ -101,17 +98,6 @@ def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:
             )
 
 
-def _extent(result: MappedPlace, image: Image.Image) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of the picture of a map, in metres.
-
-    Pixels are whole squares of cells: the last ones may reach beyond the window.
-    """
-    (x0, y0, x1, y1), cell = map_window([result.map]), result.map.resolution
-    columns, rows = round((x1 - x0) / cell), round((y1 - y0) / cell)
-    edge = cell * max(math.ceil(columns / image.width), math.ceil(rows / image.height))
-    return x0, x0 + image.width * edge, y0, y0 + image.height * edge
-
-
 def summarize_as_html(result: MappedPlace) -> str:
     """A small picture of the map and the key facts; needs neither matplotlib nor a network."""
     rows = "".join(
@@ -120,7 +106,7 @@ def summarize_as_html(result: MappedPlace) -> str:
         for name, text in key_facts(result).items()
     )
     warnings = "".join(f"<li>{html.escape(one)}</li>" for one in result.warnings)
-    picture = data_uri(_preview(result))
+    picture = data_uri(_draw_preview(result))
     return (
         "<div style='display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start'>"
         f"<img alt='map with trajectory' src='{picture}'><div><table>{rows}</table>"
@@ -138,42 +124,27 @@ def key_facts(result: MappedPlace) -> dict[str, str]:
         span, steps = stamps[scans], np.diff(_track(result)[scans], axis=0)
         seconds += float(span[-1] - span[0]) * 1e-9
         distance += float(np.linalg.norm(steps, axis=1).sum())
-    hits, dynamic = _count_hits(result.hit, result.p_static)
+    counts = count_labels(result.hit, result.p_static)
+    beams, hits = (f"{counts[name]:,}".replace(",", _SPACE) for name in ("beams", "hits"))
     return {
         "scans": f"{len(stamps)} in {seconds:.1f} s",
         "distance": f"{distance:.1f} m",
-        "beams": f"{_group_digits(len(result.p_static))}, {_group_digits(hits)} of them hits",
-        "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
+        "beams": f"{beams}, {hits} of them hits",
+        "dynamic": f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of the hits",
         "moving objects": str(len(result.objects)),
         "quality": _describe_quality(result.quality),
         "map": f"{width:.1f} m x {height:.1f} m, cells of {grid.resolution:g} m",
     }
 
 
-def _group_digits(count: int) -> str:
-    """A number with its thousands set apart."""
-    return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
-
-
 def _describe_quality(quality: Quality) -> str:
     """Overall, of labels and of geometry, 0 to 100, as far as known."""
-    parts = {"labels": quality.labels, "geometry": quality.geometry}
-    known = ", ".join(f"{name} {value:.0f}" for name, value in parts.items() if value is not None)
-    if quality.overall is None:
-        return f"{known} of 100" if known else "unknown"
-    return f"{quality.overall:.0f} of 100 ({known})"
+    parts = {name: getattr(quality, name) for name in ("overall", "labels", "geometry")}
+    known = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
+    return f"{', '.join(known)} of 100" if known else "unknown"
 
 
-def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[int, int]:
-    """Numbers of hits, and of dynamic ones."""
-    hits = dynamic = 0
-    for block in iter_blocks(hit, p_static):
-        hits += int(np.count_nonzero(hit[block]))
-        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
-    return hits, dynamic
-
-
-def _preview(result: MappedPlace) -> Image.Image:
+def _draw_preview(result: MappedPlace) -> Image.Image:
     """The map with the trajectory, small."""
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")

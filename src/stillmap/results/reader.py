@@ -22,6 +22,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
+from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
 Float = NDArray[np.float64]
@@ -131,6 +132,22 @@ def read_labels(result: Path) -> Labels:
         raise InputError("does not rise from 0", where=str(folder / "offset.npy"))
     p_static = read_probabilities(folder / "p_static.npy", beams)
     return Labels(stamp_ns, offset, p_static, read_array(folder / "hit.npy", (beams,), np.bool_))
+
+
+def count_labels(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> dict[str, int]:
+    """`beams`, `hits`, `max_range`, `unusable` and `dynamic` of labels (M,)."""
+    hits = dynamic = unusable = 0
+    for block in iter_blocks(hit, p_static):
+        hits += int(np.count_nonzero(hit[block]))
+        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
+        unusable += int(np.count_nonzero(np.isnan(p_static[block])))
+    return {
+        "beams": len(hit),
+        "hits": hits,
+        "max_range": len(hit) - hits - unusable,
+        "unusable": unusable,
+        "dynamic": dynamic,
+    }
 
 
 def read_colors(result: Path, beams: int) -> NDArray[np.uint8] | None:
@@ -308,18 +325,18 @@ def read_tracks(path: Path) -> list[Track]:
 
 
 def _to_track(one: _Object) -> Track:
-    track = one.track
-    numbers = np.stack([np.array(c, np.float64) for c in (track.x, track.y, track.vx, track.vy)], 1)
-    z = None if track.z is None else np.array(track.z)
-    if len(numbers) != len(track.stamp_ns) or not len(numbers):
-        raise ValueError("columns of unequal length")
-    if not np.isfinite([*numbers.ravel(), *one.size, *([] if z is None else z)]).all():
+    track, stamp_ns = one.track, np.array(one.track.stamp_ns, np.int64)
+    columns = [track.x, track.y, track.vx, track.vy, *([] if track.z is None else [track.z])]
+    if {len(column) for column in columns} != {len(stamp_ns)} or not len(stamp_ns):
+        raise ValueError("columns of unequal length, or empty ones")
+    x, y, vx, vy, *z = np.array(columns, np.float64)
+    if not (np.isfinite(columns).all() and np.isfinite(one.size).all()):
         raise ValueError("a number is not finite")
-    if len(one.size) != (2 if z is None else 3) or (z is not None and len(z) != len(numbers)):
+    if len(one.size) != 2 + len(z):
         raise ValueError(f"a size of {len(one.size)} lengths")
-    stamp_ns, xy, velocity = np.array(track.stamp_ns, np.int64), numbers[:, :2], numbers[:, 2:]
+    xy, velocity = np.stack([x, y], axis=1), np.stack([vx, vy], axis=1)
     known = (one.beams, one.p_dynamic, one.session, one.p_identity)
-    return Track(one.id, one.size, stamp_ns, xy, velocity, z, *known)
+    return Track(one.id, one.size, stamp_ns, xy, velocity, z[0] if z else None, *known)
 
 
 # run.json

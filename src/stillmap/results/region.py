@@ -1,7 +1,7 @@
 """Limits a result to the option `output.region`: poses and labels stay those of all scans."""
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from stillmap.pipeline.snapshots import extent
 from stillmap.tracking import FlowMap, MovingObject
 
 Some = TypeVar("Some", bound=MappingResult)
+_MAP_LAYERS = ("p_occupied", "alpha", "beta")
+_EVIDENCE_LAYERS = ("observations", "unobstructed", "thinly_observed")
 
 
 def require_overlap(occupancy: GridMap, region: Region | None) -> None:
@@ -47,26 +49,21 @@ def crop_result(result: Some) -> Some:
     require_overlap(result.map, region)
     block = _cells(result.map, region)
     assert block is not None
-    scratch, maps, evidence = result.recording.scratch, result.maps, result.evidence
-    filtered, raw = (
-        dataclasses.replace(
-            one,
-            **{
-                name: cut(getattr(one, name), block, scratch)
-                for name in ("p_occupied", "alpha", "beta")
-            },
-            origin=_corner(one, block),
-        )
-        for one in (maps.filtered, maps.raw)
+    scratch, corner = result.recording.scratch, _corner(result.map, block)
+
+    def crop(layers: Any, names: tuple[str, ...], **more: Any) -> Any:
+        parts = {name: cut(getattr(layers, name), block, scratch) for name in names}
+        return dataclasses.replace(layers, **parts, **more)
+
+    maps = dataclasses.replace(
+        result.maps,
+        filtered=crop(result.map, _MAP_LAYERS, origin=corner),
+        raw=crop(result.raw_map, _MAP_LAYERS, origin=corner),
+        evidence=crop(result.evidence, _EVIDENCE_LAYERS),
     )
-    counts = {
-        name: cut(getattr(evidence, name), block, scratch)
-        for name in ("observations", "unobstructed", "thinly_observed")
-    }
-    evidence = dataclasses.replace(evidence, **counts)
     return dataclasses.replace(
         result,
-        maps=dataclasses.replace(maps, filtered=filtered, raw=raw, evidence=evidence),
+        maps=maps,
         changes=[one for one in result.changes if is_inside(np.array([one.x, one.y]), region)],
         doors=[one for one in result.doors if is_inside(np.array(one.hinge), region)],
         objects=[one for one in result.objects if passes(one, region)],
@@ -95,12 +92,8 @@ def _corner(occupancy: GridMap | FlowMap, block: Block) -> tuple[float, float, f
 
 
 def _crop_traffic(traffic: FlowMap, region: Region) -> FlowMap:
-    block = _cells(traffic, region)
-    if block is None:
-        block = slice(0, 0), slice(0, 0)
+    block = _cells(traffic, region) or (slice(0, 0), slice(0, 0))
+    crossings, speed = traffic.crossings[block], traffic.speed[block]
     return dataclasses.replace(
-        traffic,
-        crossings=traffic.crossings[block],
-        speed=traffic.speed[block],
-        origin=_corner(traffic, block),
+        traffic, crossings=crossings, speed=speed, origin=_corner(traffic, block)
     )

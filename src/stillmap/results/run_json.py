@@ -1,6 +1,8 @@
 """`run.json`: the input, the resolved options, the iterations, counts, times and warnings."""
 
-from collections.abc import Callable, Mapping
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.objects import MILLIMETRES
 from stillmap.results.reader import LOCAL_ORIGIN
-from stillmap.slam import BareStretch, LoopClosure
+from stillmap.slam import LoopClosure
 from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
@@ -64,7 +66,16 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             "carried_before": result.doubts.breaks,
             "beside_the_map_from": result.doubts.unconnected,
             "ambiguous": result.doubts.ambiguous,
-            "length_unknown": [_stretch(one) for one in result.doubts.bare_stretches],
+            "length_unknown": [
+                {
+                    **{"first": one.first, "last": one.last},
+                    **{
+                        "metres": round(one.metres, MILLIMETRES),
+                        "std": round(one.std, MILLIMETRES),
+                    },
+                }
+                for one in result.doubts.bare_stretches
+            ],
         },
         "changes": [_change(one) for one in result.changes],
         "doors": [_door(one) | {"p_moved": round(one.p_moved, 4)} for one in result.doors],
@@ -182,9 +193,8 @@ def read_calibration(record: Any) -> Calibration:
 
 def _read_parameter(one: Mapping[str, Any]) -> Parameter:
     # a number that is not finite is written as None, and not applied
-    recorded, estimated, std = (
-        float("nan" if one[key] is None else one[key]) for key in ("recorded", "estimated", "std")
-    )
+    numbers = (one["recorded"], one["estimated"], one["std"])
+    recorded, estimated, std = (math.nan if n is None else float(n) for n in numbers)
     return Parameter(recorded, estimated, std, bool(one["applied"]))
 
 
@@ -192,22 +202,16 @@ def _loop(one: LoopClosure) -> dict[str, Any]:
     return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
 
 
-def _stretch(one: BareStretch) -> dict[str, Any]:
-    return {
-        "first": one.first,
-        "last": one.last,
-        "metres": round(one.metres, MILLIMETRES),
-        "std": round(one.std, MILLIMETRES),
-    }
+def _in_millimetres(metres: Iterable[float]) -> list[float]:
+    return [round(length, MILLIMETRES) for length in metres]
 
 
 def _change(one: Change) -> dict[str, Any]:
+    center = (one.x, one.y) if one.z is None else (one.x, one.y, one.z)
     return {
         "kind": one.kind,
-        "x": round(one.x, MILLIMETRES),
-        "y": round(one.y, MILLIMETRES),
-        **({} if one.z is None else {"z": round(one.z, MILLIMETRES)}),
-        "size": [round(metres, MILLIMETRES) for metres in one.size],
+        **dict(zip("xyz", _in_millimetres(center), strict=False)),
+        "size": _in_millimetres(one.size),
         "cells": len(one.cells),
         "before_ns": one.before_ns,
         "stamp_ns": one.stamp_ns,
@@ -219,7 +223,7 @@ def _change(one: Change) -> dict[str, Any]:
 
 def _door(door: Door) -> dict[str, Any]:
     return {
-        "hinge": [round(metres, MILLIMETRES) for metres in door.hinge],
+        "hinge": _in_millimetres(door.hinge),
         "length": round(door.length, MILLIMETRES),
         "shut": round(door.shut, MILLIMETRES),
         "open": round(door.opened, MILLIMETRES),
@@ -228,13 +232,7 @@ def _door(door: Door) -> dict[str, Any]:
 
 
 def _iteration(it: IterationRecord) -> dict[str, Any]:
-    return {
-        "number": it.number,
-        "bound": it.bound,
-        "expected_log_likelihood": it.expected_log_likelihood,
-        "held_out_log_likelihood": it.held_out_log_likelihood,
-        "changed_share": it.changed_share,
-        "touched_share": it.touched_share,
-        "seconds": it.seconds,
-        **({"source": it.source} if it.source else {}),
-    }
+    record = dataclasses.asdict(it)
+    if not it.source:
+        del record["source"]
+    return record

@@ -12,7 +12,6 @@ from stillmap.core import se2
 from stillmap.core.errors import import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.local_frame import FAR
-from stillmap.core.recording import Recording
 from stillmap.io.trajectory import pose_rows
 from stillmap.results.mapped_place import MappedPlace
 from stillmap.results.reader import Track
@@ -40,14 +39,8 @@ def make_table(result: MappedPlace, name: TableName) -> "pyarrow.Table":
         raise ValueError(f"table: expected one of {names}, got {name!r}")
     arrow = import_extra("pyarrow", "a table", "made", group="notebook")
     if name == "beams":
-        poses, p_static = result.poses, result.p_static
-        schema = _beam_schema(poses)
-        recording, deskewed = result.recording, result.deskewed
-        parts = [
-            arrow.table(_beam_columns(recording, deskewed, poses, p_static, scans), schema)
-            for scans in _split_scans(recording)
-        ]
-        return arrow.concat_tables(parts) if parts else schema.empty_table()
+        parts = [_beam_schema(result.poses).empty_table(), *_iter_beams(result)]
+        return arrow.concat_tables(parts)
     make = {"poses": _pose_columns, "objects": _object_columns, "tracks": _track_columns}[name]
     return arrow.table(make(result))
 
@@ -55,7 +48,9 @@ def make_table(result: MappedPlace, name: TableName) -> "pyarrow.Table":
 def _beam_schema(poses: Float) -> "pyarrow.Schema":
     """Names and types of the columns of a beam; see `_beam_columns`. `poses` (T, D+1, D+1)."""
     arrow = import_module("pyarrow")
-    length = arrow.float64() if _are_far(poses) else arrow.float32()
+    # 32 bits do not hold positions far from the origin to the millimetre
+    is_far = np.abs(poses[:, :-1, -1]).max(initial=0.0) > FAR
+    length = arrow.float64() if is_far else arrow.float32()
     kinds = {
         "scan": arrow.int32(),
         "stamp_ns": arrow.int64(),
@@ -68,50 +63,36 @@ def _beam_schema(poses: Float) -> "pyarrow.Schema":
     return arrow.schema([arrow.field(name, kind, nullable=False) for name, kind in kinds.items()])
 
 
-def _are_far(poses: Float) -> bool:
-    """True if 32 bits do not hold positions of poses (T, D+1, D+1) to the millimetre."""
-    return bool(np.abs(poses[:, :-1, -1]).max(initial=0.0) > FAR)
-
-
-def _beam_columns(
-    recording: Recording,
-    deskewed: Recording,
-    poses: Float,
-    p_static: NDArray[np.float32],
-    scans: slice,
-) -> dict[str, NDArray[Any]]:
-    """Columns of the beams of a slice of scans, in the order of the recording.
+def _iter_beams(result: MappedPlace) -> Iterator["pyarrow.Table"]:
+    """Tables of about a million beams, of whole scans, in the order of the recording.
 
     `scan` (from 0), `stamp_ns`, `beam` (index in the scan), `x`, `y`, in 3D `z` (end point in m in
     the map frame; 64 bits where it is far from the origin), `range` (m), `hit`, `p_static`.
     Unusable beams are NaN.
     """
-    offset = recording.offset[scans.start : scans.stop + 1]
-    beams = slice(int(offset[0]), int(offset[-1]))
-    scan = np.repeat(np.arange(scans.start, scans.stop, dtype=np.int32), np.diff(offset))
-    number = np.arange(beams.start, beams.stop)
-    ends = deskewed.end_points(number, poses)
-    if not _are_far(poses):
-        ends = ends.astype(np.float32)
-    points = recording.points[beams].astype(np.float64)
-    return {
-        "scan": scan,
-        "stamp_ns": recording.stamp_ns[scan],
-        "beam": (number - recording.offset[scan]).astype(np.int32),
-        **{axis: np.ascontiguousarray(ends[:, k]) for k, axis in enumerate("xyz"[: ends.shape[1]])},
-        "range": np.sqrt(sum(column * column for column in points.T)).astype(np.float32),
-        "hit": np.asarray(recording.hit[beams]),
-        "p_static": np.asarray(p_static[beams]),
-    }
-
-
-def _split_scans(recording: Recording) -> Iterator[slice]:
-    """Ranges of scans of about a million beams together, at least one scan each."""
-    first, T = 0, recording.n_scans
+    arrow, recording, deskewed = import_module("pyarrow"), result.recording, result.deskewed
+    schema, first, T = _beam_schema(result.poses), 0, recording.n_scans
     while first < T:
         end = int(np.searchsorted(recording.offset, recording.offset[first] + _ROWS, "right")) - 1
         end = min(max(end, first + 1), T)
-        yield slice(first, end)
+        offset = recording.offset[first : end + 1]
+        beams = slice(int(offset[0]), int(offset[-1]))
+        scan = np.repeat(np.arange(first, end, dtype=np.int32), np.diff(offset))
+        number = np.arange(beams.start, beams.stop)
+        ends = deskewed.end_points(number, result.poses)
+        points = recording.points[beams].astype(np.float64)
+        columns = {
+            "scan": scan,
+            "stamp_ns": recording.stamp_ns[scan],
+            "beam": (number - recording.offset[scan]).astype(np.int32),
+            **dict(zip("xyz", ends.T, strict=False)),
+            "range": np.sqrt(sum(column * column for column in points.T)),
+            "hit": recording.hit[beams],
+            "p_static": result.p_static[beams],
+        }
+        kinds = {one.name: one.type.to_pandas_dtype() for one in schema}
+        columns = {name: np.ascontiguousarray(c, kinds[name]) for name, c in columns.items()}
+        yield arrow.table(columns, schema)
         first = end
 
 
@@ -126,16 +107,13 @@ def write_parquet(result: MappedPlace, path: Path) -> None:
         InputError: pyarrow is not installed, or the file cannot be written.
     """
     parquet = import_extra("pyarrow.parquet", path, "written")
-    arrow, recording, deskewed = import_module("pyarrow"), result.recording, result.deskewed
-    schema = _beam_schema(result.poses)
     with (
         atomic_file(path) as work,
         work.open("wb") as file,  # not by name: it need not be UTF-8
-        parquet.ParquetWriter(file, schema, compression="zstd") as writer,
+        parquet.ParquetWriter(file, _beam_schema(result.poses), compression="zstd") as writer,
     ):
-        for scans in _split_scans(recording):
-            columns = _beam_columns(recording, deskewed, result.poses, result.p_static, scans)
-            writer.write_table(arrow.table(columns, schema=schema), row_group_size=1 << 40)
+        for part in _iter_beams(result):
+            writer.write_table(part, row_group_size=1 << 40)
 
 
 def _pose_columns(result: MappedPlace) -> dict[str, NDArray[Any]]:

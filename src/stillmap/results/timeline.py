@@ -154,25 +154,25 @@ def read_changes(folder: Path, names: Sequence[str]) -> list[SessionChange]:
     """
     path = folder / CHANGES
     changes = parse(read_json(path, _MAX_JSON, HINT), list[SessionChange], path, HINT)
-    try:
-        if len({len(box) for one in changes for box in (one.box, one.from_box or one.box)}) > 1:
-            raise ValueError("boxes in 2D and in 3D")
-        for one in changes:
-            before, after = (list(names).index(name) for name in one.between)
-            if before >= after:
-                raise ValueError(f"change {one.id} ends before it begins")
-            if (one.kind == "moved") != (one.from_box is not None):
-                raise ValueError(f"change {one.id} has no box of where it was, or one too many")
-            if not {len(box) for box in (one.box, one.from_box or one.box)} <= {4, 6}:
-                raise ValueError(f"a box of {len(one.box)} numbers")
-            corners = np.array(one.boxes)
-            if not np.isfinite(corners).all() or not (corners[:, 0] <= corners[:, 1]).all():
-                raise ValueError("a box whose corners are exchanged, or not finite")
-        if len({one.id for one in changes}) < len(changes):
-            raise ValueError("two changes have one id")
-    except ValueError as error:
-        raise InputError(f"is damaged: {error}", where=str(path), hint=HINT) from error
+    size, ids = len(changes[0].box) if changes else 4, set[int]()
+    for one in changes:
+        if one.id in ids or size not in (4, 6) or not _is_sound(one, size, list(names)):
+            what = f"is damaged: change {one.id} has an id, sessions or boxes that cannot be"
+            raise InputError(what, where=str(path), hint=HINT)
+        ids.add(one.id)
     return changes
+
+
+def _is_sound(change: SessionChange, size: int, names: list[str]) -> bool:
+    """True if the sessions of a change are in order, and its boxes have so many numbers."""
+    before, after = change.between
+    if not {before, after} <= {*names} or names.index(before) >= names.index(after):
+        return False
+    boxes = [change.box] if change.from_box is None else [change.box, change.from_box]
+    if (change.kind == "moved") != (len(boxes) == 2) or any(len(box) != size for box in boxes):
+        return False
+    corners = np.array(change.boxes)
+    return bool(np.isfinite(corners).all() and (corners[:, 0] <= corners[:, 1]).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,12 +228,13 @@ def read_states(folder: Path) -> tuple[ChangedCells, list[str]]:
     K, S = len(cells) if cells.ndim else 0, len(sessions) if sessions.ndim else 0
     shapes = [(K, 2), (K, S), (K, S), (K,), (), (S,)]
     kinds = "".join(one.dtype.kind for one in arrays.values())
-    if [one.shape for one in arrays.values()] != shapes or kinds != "ibbbfU" or not S:
-        raise InputError("is damaged: arrays of other shapes", where=str(path), hint=HINT)
-    if not 0.0 < float(resolution) < 100.0 or not (abs(cells.astype(np.float64)) < _MAX_CELL).all():
+    if (
+        [one.shape for one in arrays.values()] != shapes
+        or (kinds != "ibbbfU" or not S)
+        or not (abs(cells.astype(np.float64)) < _MAX_CELL).all()
+        or not (0.0 < float(resolution) < 100.0 and observed.any(axis=1).all())
+    ):
         raise InputError("is damaged: cells that cannot be", where=str(path), hint=HINT)
-    if not observed.any(axis=1).all():
-        raise InputError("is damaged: a cell that no session observed", where=str(path), hint=HINT)
     changed = ChangedCells(cells.astype(np.int64), occupied, observed, shown, float(resolution))
     return changed, [str(name) for name in sessions]
 
