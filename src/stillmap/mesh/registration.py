@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.range_image import Patch
+from stillmap.mesh.range_image import Patch, vertex_normals
 from stillmap.mesh.segmentation import (
     SPACING,
     DynamicReturns,
@@ -25,7 +25,6 @@ from stillmap.mesh.segmentation import (
 )
 from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Float, Index, Mesh, remove_small_components
-from stillmap.mesh.triangulation import vertex_normals
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
 _MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface

@@ -5,7 +5,6 @@ Curless and Levoy, "A Volumetric Method for Building Complex Models from Range I
 """
 
 from collections.abc import Callable, Iterable
-from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,13 @@ from stillmap.core.errors import import_extra
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import MeshOptions
-from stillmap.mesh.range_image import Patch, ScanLayout, find_scan_layout, triangulate_scans
+from stillmap.mesh.range_image import (
+    Patch,
+    ScanLayout,
+    find_scan_layout,
+    range_std,
+    triangulate_scans,
+)
 from stillmap.mesh.triangle_mesh import (
     Float,
     Float32,
@@ -34,12 +39,11 @@ from stillmap.mesh.triangle_mesh import (
     simplify_to_budget,
     weld,
 )
-from stillmap.mesh.triangulation import range_std
 
 _SAMPLED_PATCHES = 8
 _MIN_VOXEL, _MAX_VOXEL = 0.02, 0.2  # m; depth cameras are no more exact than the first
 _NOISE_RATIO = 2.5  # voxel edge over the standard deviation of ranges, at least
-_MAX_SPACING = 0.75  # voxels between rows that are used
+_MAX_SPACING = 0.75  # voxels between beams that are used
 _MAX_BYTES = 0.75e9  # of the voxels
 _AREA_CELL = 0.5  # m, cells by which surface area is estimated
 _SAMPLED_BEAMS = 200_000
@@ -49,8 +53,6 @@ _MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
 _MIN_TURN = 0.1  # rad, likewise
 _SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a mover
 _SAMPLED_SCANS = 64  # of which the ranges are taken
-_MIN_CELL = 1e-3  # m, of the cells by which viewpoints nearby are found
-_AROUND = list(product((-1, 0, 1), repeat=3))
 
 
 def median_range(recording: Recording) -> float:
@@ -63,29 +65,23 @@ def median_range(recording: Recording) -> float:
     return float(np.median(ranges)) if len(ranges) else 0.0
 
 
-def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
+def select_scans(T_map_sensor: Float, sensor: Int32, scene_range: float) -> Index:
     """The first `_SCANS_PER_PLACE` scans from each viewpoint.
 
     Args:
         T_map_sensor: (T, 4, 4).
         sensor: (T,) sensor of each scan.
-        range: metres, median.
+        scene_range: metres, median.
     """
     position, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
-    travel = _MIN_TRAVEL_SHARE * range
-    # by cells, so that each scan is compared only with those around
-    cells = np.floor(position / max(travel, _MIN_CELL)).astype(np.int64).tolist()
-    known: dict[tuple[int, ...], list[int]] = {}
     chosen = list[int]()
-    for t, (x, y, z) in enumerate(cells):
-        mine = int(sensor[t])
-        around = [known.get((mine, x + i, y + j, z + k), ()) for i, j, k in _AROUND]
-        before = np.fromiter(chain.from_iterable(around), np.intp)
-        near = before[np.linalg.norm(position[before] - position[t], axis=1) < travel]
+    for t in range(len(position)):
+        near = np.array(chosen, np.intp)
+        distance = np.linalg.norm(position[near] - position[t], axis=1)
+        near = near[(sensor[near] == sensor[t]) & (distance < _MIN_TRAVEL_SHARE * scene_range)]
         cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
         if np.count_nonzero(cosine > np.cos(_MIN_TURN)) < _SCANS_PER_PLACE:
             chosen.append(t)
-            known.setdefault((mine, x, y, z), []).append(t)
     return np.array(chosen, np.intp)
 
 
@@ -94,11 +90,11 @@ def choose_resolution(
     poses: Float,
     layout: ScanLayout,
     voxel_size: float | None = None,
-) -> tuple[float, int]:
-    """The edge of a voxel in metres, and the stride of rows and columns of range images.
+) -> tuple[float, float]:
+    """The edge of a voxel in metres, and the angle in rad between beams of range images.
 
     A voxel is as wide as the beam spacing on surfaces, and wider than range noise; larger where
-    memory would exceed its limit. The stride keeps the spacing of beams below that.
+    memory would exceed its limit. Where beams lie much denser than voxels, some are left out.
 
     Args:
         recording: 3D, deskewed.
@@ -113,14 +109,15 @@ def choose_resolution(
     patches = [make() for make in triangulate_scans(recording, poses, some)]
     patches = [one for one in patches if len(one.faces)]
     if not patches:
-        return voxel_size or _MAX_VOXEL, 1
+        return voxel_size or _MAX_VOXEL, 0.0
     spacing = float(np.median([beam_spacing(one) for one in patches]))
     ranges = [np.linalg.norm(one.points - one.origin, axis=1) for one in patches]
     noises = [range_std(away, one.faces) for away, one in zip(ranges, patches, strict=True)]
     noise = float(np.median(noises))
     wanted = float(np.clip(max(spacing, _NOISE_RATIO * noise), _MIN_VOXEL, _MAX_VOXEL))
     voxel = voxel_size or max(wanted, min_voxel_size(recording, poses))
-    return voxel, max(int(_MAX_SPACING * voxel / spacing), 1) if spacing > 0.0 else 1
+    wide = _MAX_SPACING * voxel
+    return voxel, wide / float(np.median(np.concatenate(ranges))) if wide >= 2.0 * spacing else 0.0
 
 
 def beam_spacing(patch: Patch) -> float:
@@ -173,8 +170,8 @@ def build_surface(
     T = recording.T_map_sensor(poses)
     chosen = select_scans(T, recording.sensor, median_range(recording))
     layout = find_scan_layout(recording, chosen)
-    voxel, stride = choose_resolution(recording, poses, layout, options.voxel_size)
-    layout = layout._replace(stride=stride)
+    voxel, min_angle = choose_resolution(recording, poses, layout, options.voxel_size)
+    layout = layout._replace(min_angle=min_angle)
     n = len(layout.groups)
 
     def weighted(make: Callable[[], Patch]) -> tuple[Patch, Float32]:

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh import range_image, triangulation
+from stillmap.mesh import range_image
 from stillmap.mesh.range_image import find_scan_layout, triangulate_scans
-from stillmap.mesh.triangulation import split_rows
 
 
 @pytest.fixture(autouse=True)
 def loose(monkeypatch):
     """The beams of these tests lie far apart."""
-    monkeypatch.setattr(triangulation, "_MAX_EDGE", 5.0)
-    monkeypatch.setattr(triangulation, "_MAX_EDGE_SHARE", 2.0)
+    monkeypatch.setattr(range_image, "_MAX_EDGE", 5.0)
+    monkeypatch.setattr(range_image, "_MAX_EDGE_SHARE", 2.0)
 
 
 def patches(recording, poses):
@@ -25,25 +24,6 @@ def looks_back(patch):
     a, b, c = np.moveaxis(patch.points[patch.faces], 1, 0)
     sight = patch.origin[patch.faces[:, 0]] - a
     return np.einsum("ni,ni->n", np.cross(b - a, c - a), sight) > 0
-
-
-@pytest.mark.parametrize(
-    ("sensor", "made", "length"),
-    [
-        ("lidar", (), 24),
-        ("lidar", (240, 24, "rings"), 240),
-        ("lidar", (360, 16), 16),
-        ("lidar", (1800, 16, "rings"), 1800),
-        ("picture", (), 64),
-        ("picture", (40, 60), 40),
-    ],
-)
-def test_rows_are_found(room, sensor, made, length):
-    looking = getattr(room, sensor)(*made)
-    assert range_image.find_row_length(looking) == length
-    noisy = looking.copy()
-    noisy[np.random.default_rng(0).random(len(noisy)) < 0.2] = np.nan
-    assert range_image.find_row_length(noisy) == length
 
 
 def test_planar_lasers_are_told_from_others(room):
@@ -71,8 +51,6 @@ def test_rows_with_gaps_make_the_same_surface(room, rows_are, sense):
     rng = np.random.default_rng(0)
     sector = np.arctan2(looking[:, 1], looking[:, 0])
     looking = looking[(rng.random(len(looking)) < 0.95) & (np.abs(sector - 1.0) > 0.2)]
-    found = split_rows(looking)
-    assert len(found.first) - 1 == (240 - 15 if rows_are == "columns" else 40)
     recording = room.scans(looking, room.standing())
     _, (patch,) = patches(recording, room.standing())
     looking = patch.points[patch.faces]
