@@ -20,8 +20,9 @@ from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
 from stillmap.mesh.segmentation import DynamicReturns
 from stillmap.mesh.texture import TexturedMesh, bake_texture
 from stillmap.mesh.texturing import assign_object_views, times_in_view
-from stillmap.mesh.triangle_mesh import Float, Int32, Mesh, Tell
+from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.tsdf import build_surface
+from stillmap.mesh.types import Float, Int32, Tell
 from stillmap.mesh.view_selection import read_with_gains
 from stillmap.mesh.views import (
     UNREADABLE,

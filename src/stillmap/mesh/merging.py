@@ -13,7 +13,7 @@ import numpy as np
 from stillmap.core.square_box import component_labels
 from stillmap.mesh.segmentation import LINK, SPACING, DynamicReturns, cluster_cells, segment_object
 from stillmap.mesh.tracked_boxes import TrackedBox
-from stillmap.mesh.triangle_mesh import Bool, Float, Index
+from stillmap.mesh.types import Bool, Float, Index
 from stillmap.tracking import MovingObject
 
 MAJORITY = 0.5

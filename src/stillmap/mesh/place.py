@@ -14,18 +14,8 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.texture import sample_bilinear
 from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
-from stillmap.mesh.triangle_mesh import (
-    Bool,
-    Float,
-    Float32,
-    Image,
-    Index,
-    Int32,
-    Mesh,
-    Tell,
-    no_tell,
-    subdivide,
-)
+from stillmap.mesh.triangle_mesh import Mesh, subdivide
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
 from stillmap.mesh.view_selection import (
     Candidates,
     estimate_gains,
@@ -159,7 +149,7 @@ def p_unoccluded(mesh: Mesh, faces: Index, view: View, inputs: MeshInputs) -> Fl
     From the returns near its timestamp, and where there are none from the boxes of moving objects;
     the minimum over the corners and the center of a face.
     """
-    part = mesh.subset(faces)
+    part = mesh.select(faces)
     points = np.concatenate([part.vertices, part.centers])
     there = boxes_at(inputs.boxes, 1e-9 * (view.stamp_ns - inputs.start_ns))
     free = 1.0 - occlusion_probability(there, view.position, points)

@@ -17,7 +17,7 @@ from stillmap.mesh.segmentation import IMAGE_WINDOW, DynamicReturns
 from stillmap.mesh.texture import GRAY, TexturedMesh, TextureSampler, avoid_gray, sample_bilinear
 from stillmap.mesh.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN, TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
 from stillmap.mesh.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.views import View
 from stillmap.mesh.visibility import NEAR, project_inside

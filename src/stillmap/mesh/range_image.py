@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from stillmap.core.recording import Recording
-from stillmap.mesh.triangle_mesh import (
-    Bool,
-    Float,
-    Index,
-    Int32,
-    cross_columns,
-    dot_columns,
-    normalize_columns,
-    row_lengths,
-)
+from stillmap.mesh.triangle_mesh import cross_columns, dot_columns, normalize_columns, row_lengths
+from stillmap.mesh.types import Bool, Float, Index, Int32
 from stillmap.slam.deskew import MAX_SCAN_GAP
 
 _MAX_SPACING_RATIO = 3.0  # of a triangle's longest edge to the median: else it spans a hole
@@ -175,8 +167,8 @@ def _make_patch(recording: Recording, poses: Float, scans: Index, layout: ScanLa
     else:
         faces = _triangulate_directions(directions, use, layout.min_angle)
     faces, standoff = filter_faces(points, origin, faces)
-    used, faces = np.unique(faces, return_inverse=True)
-    faces = faces.reshape(-1, 3).astype(np.int32)
+    used, number = np.unique(faces, return_inverse=True)
+    faces = number.reshape(-1, 3).astype(np.int32)
     return Patch(points[used], faces, beam[used], origin[used], standoff[used])
 
 
@@ -206,7 +198,7 @@ def _triangulate_directions(directions: Float, use: Bool, min_angle: float) -> I
     faces = ConvexHull(corners).simplices
     edge = np.linalg.norm(corners[faces] - corners[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
     kept = (edge <= _MAX_SPACING_RATIO * np.median(edge)) & use[beams[faces]].all(axis=1)
-    return beams[faces[kept]].astype(np.int32)
+    return np.asarray(beams[faces[kept]], np.int32)
 
 
 def triangulate_grid(points: Float, use: Bool, number: Int32) -> Int32:

@@ -28,8 +28,9 @@ from stillmap.mesh.registration import (
 )
 from stillmap.mesh.segmentation import HALF_CAR, DynamicReturns, find_best_interval
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
-from stillmap.mesh.triangle_mesh import Float, Index, Mesh, subdivide
+from stillmap.mesh.triangle_mesh import Mesh, subdivide
 from stillmap.mesh.tsdf import integrate_patches
+from stillmap.mesh.types import Float, Index
 
 MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it
 _MAX_VIEW_OFFSET = 0.05  # m of a partial surface from the best one: else it is left out

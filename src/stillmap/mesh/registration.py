@@ -24,7 +24,8 @@ from stillmap.mesh.segmentation import (
     triangulate_beams,
 )
 from stillmap.mesh.tracked_boxes import ObjectFrame
-from stillmap.mesh.triangle_mesh import Float, Index, Mesh, remove_small_components
+from stillmap.mesh.triangle_mesh import Mesh, remove_small_components
+from stillmap.mesh.types import Float, Index
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
 _MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface

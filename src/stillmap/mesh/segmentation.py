@@ -12,7 +12,8 @@ from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.range_image import SMOOTHING_ROUNDS, beam_directions
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
-from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Index, Int32, Mesh
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
 from stillmap.tracking import MovingObject
 
 IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid

@@ -15,19 +15,8 @@ import stillmap._core as _core
 from stillmap.core.camera import project
 from stillmap.core.errors import import_extra
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.triangle_mesh import (
-    Bool,
-    Float,
-    Float32,
-    Image,
-    Index,
-    Int32,
-    Int64,
-    Mesh,
-    planar_areas,
-    row_lengths,
-    subdivide,
-)
+from stillmap.mesh.triangle_mesh import Mesh, planar_areas, row_lengths, subdivide
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Int64
 from stillmap.mesh.views import View
 
 GRAY = (128, 128, 128)  # of faces that no image textures
@@ -335,8 +324,9 @@ class TextureSampler:
         self._of, self._max_distance = textured, max_distance
         self._mesh = Mesh(textured.vertices, textured.faces)
         self._normals = self._mesh.normals()
+        self._triangles: Any = import_extra("trimesh.triangles", "mesh.glb", "made", group="mesh")
         shown = np.flatnonzero((textured.view >= 0) & (textured.page >= 0))
-        samples, of = subdivide(self._mesh.subset(shown), _SAMPLE_EDGE)
+        samples, of = subdivide(self._mesh.select(shown), _SAMPLE_EDGE)
         self._face = shown[of]
         self._samples = cKDTree(samples.centers)
 
@@ -367,7 +357,9 @@ class TextureSampler:
         for sample in np.asarray(nearest).T:
             some = np.flatnonzero(sample < self._samples.n)
             mine = self._face[sample[some]]
-            share = barycentric(self._mesh.corners[mine], points[some])
+            share = self._triangles.points_to_barycentric(self._mesh.corners[mine], points[some])
+            share = np.maximum(share, 0.0)
+            share /= share.sum(axis=1, keepdims=True)
             place = np.einsum("nk,nkd->nd", share, self._mesh.corners[mine])
             away = row_lengths(points[some] - place)
             facing = np.einsum("nd,nd->n", self._normals[mine], origins[some] - place) > 0.0
@@ -375,17 +367,6 @@ class TextureSampler:
             best[some[better]], face[some[better]] = away[better], mine[better]
             weight[some[better]] = share[better]
         return face, weight
-
-
-def barycentric(corners: Float, points: Float) -> Float:
-    """(n, 3) weights of the corners of triangles (n, 3, 3) at points (n, 3), within each."""
-    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal, off = np.cross(ab, ac), points - corners[:, 0]
-    square = np.maximum(np.einsum("nd,nd->n", normal, normal), 1e-300)
-    b = np.einsum("nd,nd->n", np.cross(off, ac), normal) / square
-    c = np.einsum("nd,nd->n", np.cross(ab, off), normal) / square
-    weight = np.maximum(np.stack([1.0 - b - c, b, c], axis=1), 0.0)
-    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def avoid_gray(colors: Image) -> Image:

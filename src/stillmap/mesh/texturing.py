@@ -17,7 +17,8 @@ from stillmap.mesh.place import (
 from stillmap.mesh.reconstruction import ObjectShape
 from stillmap.mesh.segmentation import IMAGE_WINDOW
 from stillmap.mesh.tracked_boxes import TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.triangle_mesh import Bool, Float, Index, Mesh, subdivide
+from stillmap.mesh.triangle_mesh import Mesh, subdivide
+from stillmap.mesh.types import Bool, Float, Index
 from stillmap.mesh.view_selection import NONE, Candidates, view_utility
 from stillmap.mesh.views import View
 from stillmap.mesh.visibility import DEPTH_SCALE, find_visible_faces, render_depth

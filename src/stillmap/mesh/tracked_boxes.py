@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.em import GroundMap
-from stillmap.mesh.triangle_mesh import Bool, Float, Index
+from stillmap.mesh.types import Bool, Float, Index
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import (
     HOLD,

@@ -5,24 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.errors import import_extra
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import component_labels
-
-Bool = NDArray[np.bool_]
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Image = NDArray[np.uint8]  # also single colors
-Index = NDArray[np.intp]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
-Tell = Callable[[int, int], None]  # called with the work done and the total
-
-
-def no_tell(done: int, total: int) -> None:
-    """Discards progress."""
+from stillmap.mesh.types import Bool, Float, Index, Int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,59 +58,33 @@ class Mesh(ShortRepr):
         return np.ascontiguousarray(cross_columns((b - a).T, (c - a).T).T)
 
     def adjacent_faces(self) -> Int32:
-        """(N, 2) pairs of faces that share an edge, the lower number first, unique and sorted.
+        """(N, 2) pairs of faces that share an edge, if no third face does."""
+        graph: Any = import_extra("trimesh.graph", "mesh.glb", "made", group="mesh")
+        return np.asarray(graph.face_adjacency(self.faces), np.int32).reshape(-1, 2)
 
-        Of an edge with more than two faces, each is paired with the next.
-        """
-        F = len(self.faces)
-        corner, next = self.faces.astype(np.int64), np.roll(self.faces, -1, axis=1)
-        key = (np.minimum(corner, next) * len(self.vertices) + np.maximum(corner, next)).ravel()
-        face = np.repeat(np.arange(F), 3)
-        order = np.argsort(key, kind="stable")
-        same = np.flatnonzero(np.diff(key[order]) == 0)
-        one, other = face[order[same]], face[order[same + 1]]
-        low, high = np.minimum(one, other), np.maximum(one, other)
-        both = np.unique((low * F + high)[low < high])
-        return np.column_stack([both // F, both % F]).astype(np.int32)
-
-    def select(self, kept: Bool) -> "Mesh":
-        """The faces marked in `kept` (F,) with their vertices, in order."""
-        return self.subset(np.flatnonzero(kept))
-
-    def subset(self, numbers: Index) -> "Mesh":
-        """The faces with numbers (n,) with their vertices, in order."""
-        faces = self.faces[numbers]
-        used = np.zeros(len(self.vertices), np.bool_)
-        used[faces] = True
-        number = np.cumsum(used, dtype=np.int64) - 1
-        return Mesh(self.vertices[used], number[faces].astype(np.int32))
+    def select(self, which: Bool | Index) -> "Mesh":
+        """The faces marked in a mask (F,), or with numbers (n,), in order, with their vertices."""
+        used, faces = np.unique(self.faces[which], return_inverse=True)
+        return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.int32))
 
 
 def concatenate_meshes(meshes: list[Mesh]) -> Mesh:
     """All faces of several meshes; vertices are not merged."""
-    first = np.cumsum([0, *(len(one.vertices) for one in meshes)])
+    first = np.cumsum([0, *(len(one.vertices) for one in meshes)], dtype=np.int32)
+    faces = [one.faces + k for one, k in zip(meshes, first[:-1], strict=True)]
     return Mesh(
         np.concatenate([np.zeros((0, 3)), *(one.vertices for one in meshes)]),
-        np.concatenate(
-            [
-                np.zeros((0, 3), np.int32),
-                *(one.faces + np.int32(k) for one, k in zip(meshes, first[:-1], strict=True)),
-            ]
-        ),
+        np.concatenate([np.zeros((0, 3), np.int32), *faces]),
     )
 
 
 def weld(mesh: Mesh) -> Mesh:
     """Merges vertices at exactly the same position and drops faces that collapse."""
     # + 0.0: zero has one sign
-    rows = np.ascontiguousarray(mesh.vertices + 0.0).view(np.dtype((np.void, 24))).ravel()
-    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
-    order = np.sort(first)
-    place = np.searchsorted(order, first)
-    faces = place[number][mesh.faces]
+    vertices, number = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)
+    faces = number.reshape(-1)[mesh.faces].astype(np.int32)
     a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    return Mesh(mesh.vertices[order], faces.astype(np.int32))
+    return Mesh(vertices, faces[(a != b) & (b != c) & (c != a)])
 
 
 def remove_small_components(mesh: Mesh, min_area: float) -> Mesh:
@@ -175,7 +136,7 @@ _K = 3.0
 _ERROR_GROWTH = 2.0  # factor by which the error grows while there are too many triangles
 _MAX_GROWTHS = 24
 
-_SUBDIVISION_ROUNDS = 12  # each halves the longest edges
+_SUBDIVISION_ROUNDS = 100  # a guard: each halves edges
 
 
 def simplification_error(voxel: float) -> float:
@@ -227,7 +188,8 @@ def simplify_to_budget(mesh: Mesh, error: float, most: int) -> Mesh:
 def subdivide(mesh: Mesh, max_edge: float | Callable[[Float], Float]) -> tuple[Mesh, Index]:
     """Subdivides faces until no edge is too long; adjacent faces stay adjacent.
 
-    Long edges are halved; triangles with one, two or three of them become two, three or four.
+    A face is halved across the longest of its long edges, in the round in which all faces of that
+    edge are.
 
     Args:
         mesh: F faces.
@@ -236,19 +198,28 @@ def subdivide(mesh: Mesh, max_edge: float | Callable[[Float], Float]) -> tuple[M
     Returns:
         The mesh, its first vertices those of the old one, and the old face (F',) of each face.
     """
-    vertices, faces = mesh.vertices, mesh.faces
-    of = np.arange(len(faces))
+    vertices, faces, of = mesh.vertices, mesh.faces, np.arange(len(mesh.faces))
     limit = _edge_limits(max_edge, vertices)
     for _ in range(_SUBDIVISION_ROUNDS):
-        long = np.column_stack(
-            [_is_long(vertices, limit, faces[:, k], faces[:, (k + 1) % 3]) for k in range(3)]
-        )
+        ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
+        key, edge = np.unique(ends @ [len(vertices), 1], return_inverse=True)
+        edge, (a, b) = edge.reshape(-1, 3), np.divmod(key, max(len(vertices), 1))
+        length = row_lengths(vertices[a] - vertices[b])
+        long = length > np.minimum(limit[a], limit[b])
         if not long.any():
             break
-        ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)  # (F, 3, 2): edges ab, bc, ca
-        middle, vertices = _add_midpoints(ends, long, vertices)
-        limit = np.concatenate([limit, _edge_limits(max_edge, vertices[len(limit) :])])
-        faces, of = _split_faces(faces, middle, of)
+        rank = np.empty(len(key), np.intp)
+        rank[np.lexsort((length, long))] = np.arange(len(key))
+        first = np.argmax(rank[edge], axis=1)
+        across = edge[np.arange(len(edge)), first]
+        halved = long & (np.bincount(across, minlength=len(key)) == np.bincount(edge.ravel()))
+        middle = len(vertices) + np.cumsum(halved) - 1
+        points = 0.5 * (vertices[a[halved]] + vertices[b[halved]])
+        vertices, limit = (
+            np.concatenate([vertices, points]),
+            np.concatenate([limit, _edge_limits(max_edge, points)]),
+        )
+        faces, of = _halve_faces(faces, of, halved[across], first, middle[across])
     return Mesh(vertices, faces), of
 
 
@@ -256,45 +227,15 @@ def _edge_limits(max_edge: float | Callable[[Float], Float], points: Float) -> F
     return max_edge(points) if callable(max_edge) else np.full(len(points), float(max_edge))
 
 
-def _is_long(vertices: Float, limit: Float, a: Int32, b: Int32) -> Bool:
-    """(F,) whether edges from a to b are too long."""
-    x, y, z = (vertices[a] - vertices[b]).T
-    return np.asarray(x * x + y * y + z * z > np.minimum(limit[a], limit[b]) ** 2)
-
-
-def _add_midpoints(ends: Int32, long: Bool, vertices: Float) -> tuple[Int32, Float]:
-    """(F, 3) midpoint vertices of long edges, -1 for others; all vertices, with these."""
-    one, other = ends[long].astype(np.int64).T
-    key = np.minimum(one, other) * len(vertices) + np.maximum(one, other)
-    key, number = np.unique(key, return_inverse=True)
-    middle = np.full(long.shape, -1, np.int32)
-    middle[long] = len(vertices) + number
-    a, b = key // len(vertices), key % len(vertices)
-    return middle, np.concatenate([vertices, 0.5 * (vertices[a] + vertices[b])])
-
-
-def _split_faces(faces: Int32, middle: Int32, of: Index) -> tuple[Int32, Index]:
-    """Splits faces by the midpoints of their edges."""
-    count = (middle >= 0).sum(axis=1)
-    parts, origin = [faces[count == 0]], [of[count == 0]]
-    for n in (1, 2, 3):
-        rows = np.flatnonzero(count == n)
-        # rotated so that the first edge has a midpoint, or with two the last one has none
-        turn = np.argmax(middle[rows] >= 0, axis=1) if n == 1 else np.zeros(len(rows), np.intp)
-        if n == 2:
-            turn = (np.argmax(middle[rows] < 0, axis=1) + 1) % 3
-        at = (np.arange(3) + turn[:, None]) % 3
-        a, b, c = np.take_along_axis(faces[rows], at, axis=1).T
-        ab, bc, ca = np.take_along_axis(middle[rows], at, axis=1).T
-        corners = {
-            1: [(a, ab, c), (ab, b, c)],
-            2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
-            3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
-        }[n]
-        for three in corners:
-            parts.append(np.stack(three, axis=1))
-            origin.append(of[rows])
+def _halve_faces(
+    faces: Int32, of: Index, halved: Bool, first: Index, middle: Index
+) -> tuple[Int32, Index]:
+    """Halves faces by the vertices in the middle of their edges that begin at corner `first`."""
+    turn = (np.arange(3) + first[halved, None]) % 3
+    a, b, c = np.take_along_axis(faces[halved], turn, axis=1).T
+    m = middle[halved].astype(np.int32)
+    parts = [faces[~halved], np.stack([a, m, c], axis=1), np.stack([m, b, c], axis=1)]
     # parts of a face side by side, in the order of the faces
-    owner = np.concatenate(origin)
+    owner = np.concatenate([of[~halved], of[halved], of[halved]])
     order = np.argsort(owner, kind="stable")
     return np.concatenate(parts)[order], owner[order]

@@ -24,21 +24,15 @@ from stillmap.mesh.range_image import (
     triangulate_scans,
 )
 from stillmap.mesh.triangle_mesh import (
-    Float,
-    Float32,
-    Index,
-    Int32,
-    Int64,
     Mesh,
-    Tell,
     concatenate_meshes,
-    no_tell,
     remove_small_components,
     simplification_error,
     simplify,
     simplify_to_budget,
     weld,
 )
+from stillmap.mesh.types import Float, Float32, Index, Int32, Int64, Tell, no_tell
 
 _SAMPLED_PATCHES = 8
 _MIN_VOXEL, _MAX_VOXEL = 0.02, 0.2  # m; depth cameras are no more exact than the first

@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array, eye_array
-from scipy.sparse.linalg import spsolve
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import lsqr
 
 from stillmap.core.camera import Images, project
 from stillmap.mesh.texture import sample_bilinear
-from stillmap.mesh.triangle_mesh import Float, Float32, Image, Index, Int32, Mesh
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32
 from stillmap.mesh.views import View, read_color_image
 
 NONE = -1
@@ -99,40 +100,32 @@ def select_views(candidates: Candidates, pairs: Int32, seam_cost: float) -> Int3
     with np.errstate(invalid="ignore"):
         cost = np.where(np.isfinite(candidates.utility), best - candidates.utility, np.inf)
     pairs = pairs[has_view[pairs].all(axis=1)]
+    a, b = pairs.T
+    sent = candidates.view[a]
+    equal = (sent[:, :, None] == candidates.view[b][:, None]) & (sent != NONE)[:, :, None]
+    ways = ((a, b, equal), (b, a, equal.transpose(0, 2, 1)))
     messages = np.zeros((2, len(pairs), K), np.float32)  # to the second face, and to the first
     belief = cost
     for _ in range(_ITERATIONS):
-        _update_messages(candidates.view, belief, pairs, messages, seam_cost)
+        new = [
+            _messages(belief[sender], messages[1 - way], same, seam_cost)
+            for way, (sender, _, same) in enumerate(ways)
+        ]
+        messages = _DAMPING * messages + (1.0 - _DAMPING) * np.stack(new)
         belief = cost.copy()
-        for way, receiver in enumerate(pairs.T[::-1]):
-            for k in range(K):
-                belief[:, k] += np.bincount(receiver, messages[way, :, k], minlength=F)
+        for way, (_, receiver, _) in enumerate(ways):
+            np.add.at(belief, receiver, messages[way])
     label = np.argmin(belief, axis=1)
     return np.where(has_view, candidates.view[np.arange(F), label], NONE).astype(np.int32)
 
 
-def _update_messages(
-    view: Int32, belief: Float32, pairs: Int32, messages: Float32, seam_cost: float
-) -> None:
-    """The next messages (2, n, K) between pairs (n, 2); in place."""
-    a, b = pairs.T
-    before = messages.copy()
-    for way, (sender, receiver) in enumerate(((a, b), (b, a))):
-        own = belief[sender]
-        own -= np.where(np.isfinite(own), before[1 - way], np.float32(0.0))
-        K = own.shape[1]
-        lowest = own[:, 0].copy()
-        for k in range(1, K):
-            np.minimum(lowest, own[:, k], out=lowest)
-        sent, received = view[sender], view[receiver]
-        for k in range(K):
-            message = lowest + np.float32(seam_cost)
-            for i in range(K):
-                equal = (sent[:, i] == received[:, k]) & (sent[:, i] != NONE)
-                message = np.where(equal, np.minimum(message, own[:, i]), message)
-            messages[way, :, k] = _DAMPING * before[way, :, k] + (1.0 - _DAMPING) * (
-                message - lowest
-            )
+def _messages(belief: Float32, received: Float32, same: Bool, seam_cost: float) -> Float32:
+    """(n, K) least costs of n senders for each view of their receivers, by the beliefs (n, K) of
+    the senders without what they received; `same` (n, K, K): a sender's and a receiver's view."""
+    own = belief - np.where(np.isfinite(belief), received, 0.0)
+    lowest = own.min(axis=1, keepdims=True)
+    kept = np.where(same, own[:, :, None], np.inf).min(axis=1)
+    return np.asarray(np.minimum(kept, lowest + seam_cost) - lowest, np.float32)
 
 
 def sample_face_colors(
@@ -204,25 +197,20 @@ def estimate_gains(view: Int32, colors: Float32, n: int) -> Float:
     kept = np.flatnonzero(count >= _MIN_FACES)
     if not len(kept):
         return np.ones((n, 3))
-    d = np.stack([_group_medians(of, brighter[:, c], count) for c in range(3)], axis=1)
-    spread = _group_medians(of, np.abs(brighter - d[of]).max(axis=1), count)
-    w = count / (count + _HALF_WEIGHT_FACES) / (1.0 + (spread / _SPREAD) ** 2)
-    g = _solve(pair[kept] // n, pair[kept] % n, w[kept], d[kept], n)
+    groups = np.arange(len(pair))
+    d = np.stack([ndimage.median(brighter[:, c], of, groups) for c in range(3)], axis=1)
+    spread = ndimage.median(np.abs(brighter - d[of]).max(axis=1), of, groups)
+    w = np.sqrt(count / (count + _HALF_WEIGHT_FACES) / (1.0 + (spread / _SPREAD) ** 2))[kept]
+    rows, ones = np.tile(np.arange(len(kept)), 2), np.concatenate([w, -w])
+    images = np.concatenate([pair[kept] // n, pair[kept] % n])
+    equations = coo_array((ones, (rows, images)), shape=(len(kept), n)).tocsr()
+    damp = np.sqrt(_REGULARIZATION)
+    g = np.stack([lsqr(equations, w * d[kept, c], damp)[0] for c in range(3)], axis=1)
+    g = np.clip(g, -_MAX_LOG_GAIN, _MAX_LOG_GAIN)
     left = np.median(np.abs(brighter + g[other] - g[one]))
     if left > _MIN_IMPROVEMENT * np.median(np.abs(brighter)):
         return np.ones((n, 3))
     return np.asarray(np.exp(g))
-
-
-def _solve(i: NDArray[np.integer], j: NDArray[np.integer], w: Float, d: Float, n: int) -> Float:
-    """(n, 3) log gains of m pairs i, j (m,) with weights (m,) and log ratios (m, 3)."""
-    rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
-    normal = coo_array((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(n, n)).tocsc()
-    right = np.zeros((n, 3))
-    np.add.at(right, i, w[:, None] * d)
-    np.add.at(right, j, -w[:, None] * d)
-    g = spsolve(normal + _REGULARIZATION * eye_array(n, format="csc"), right).reshape(n, 3)
-    return np.asarray(np.clip(g, -_MAX_LOG_GAIN, _MAX_LOG_GAIN), np.float64)
 
 
 def _log_ratios(view: Int32, colors: Float32) -> tuple[Int32, Int32, Float32]:
@@ -240,13 +228,6 @@ def _log_ratios(view: Int32, colors: Float32) -> tuple[Int32, Int32, Float32]:
         others.append(np.maximum(low, high))
         ratios.append(np.where((low < high)[:, None], brighter, -brighter))
     return np.concatenate(ones), np.concatenate(others), np.concatenate(ratios)
-
-
-def _group_medians(of: Index, values: Float32, count: Index) -> Float:
-    """(m,) lower median of the values of each of m groups."""
-    order = np.lexsort((values, of))
-    middle = np.cumsum(count) - count + (count - 1) // 2
-    return np.asarray(values[order[middle]], np.float64)
 
 
 def read_with_gains(images: Images, views: Sequence[View], gains: Float) -> Callable[[View], Image]:
