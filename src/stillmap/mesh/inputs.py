@@ -6,11 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, max_scan_duration_ns
 from stillmap.mesh.range_image import has_planar_scans
 from stillmap.mesh.tracked_boxes import TrackedBox
-from stillmap.mesh.types import Bool, Float, Float32, Index
 from stillmap.tracking import MovingObject
 
 _SCANS_AROUND = 1  # before and after a time, whose beams may be of it

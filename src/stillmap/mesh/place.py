@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.texture import sample_bilinear
 from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
-from stillmap.mesh.triangle_mesh import Mesh, subdivide
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
+from stillmap.mesh.triangle_mesh import Image, Mesh, Tell, no_tell, subdivide
 from stillmap.mesh.view_selection import (
     Candidates,
     estimate_gains,

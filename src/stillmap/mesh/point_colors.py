@@ -7,17 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import Background
-from stillmap.mesh.segmentation import IMAGE_WINDOW, DynamicReturns
+from stillmap.mesh.reconstruction import IMAGE_WINDOW
+from stillmap.mesh.returns import DynamicReturns
 from stillmap.mesh.texture import GRAY, TexturedMesh, TextureSampler, avoid_gray, sample_bilinear
 from stillmap.mesh.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN, TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
+from stillmap.mesh.triangle_mesh import Image, Tell, no_tell
 from stillmap.mesh.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.views import View
 from stillmap.mesh.visibility import NEAR, project_inside

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from stillmap.core.array_types import Bool, Float, Index, Int32
 from stillmap.core.recording import Recording
 from stillmap.mesh.triangle_mesh import cross_columns, dot_columns, normalize_columns, row_lengths
-from stillmap.mesh.types import Bool, Float, Index, Int32
 from stillmap.slam.deskew import MAX_SCAN_GAP
 
-_MAX_SPACING_RATIO = 3.0  # of a triangle's longest edge to the median: else it spans a hole
+_MAX_RADIUS_RATIO = 3.0  # of a triangle's circumcircle to the median: else it spans a hole
 _MIN_BEAMS = 4  # of a scan whose layout can be told
 _JITTER = (
     1e-6  # rad, of directions: four on a circle, as in every grid, take Qhull ten times longer
@@ -196,8 +196,10 @@ def _triangulate_directions(directions: Float, use: Bool, min_angle: float) -> I
     rng = np.random.default_rng(0)
     corners = beam_directions(directions[beams] + rng.normal(0.0, _JITTER, (len(beams), 3)))
     faces = ConvexHull(corners).simplices
-    edge = np.linalg.norm(corners[faces] - corners[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
-    kept = (edge <= _MAX_SPACING_RATIO * np.median(edge)) & use[beams[faces]].all(axis=1)
+    edges = corners[faces] - corners[np.roll(faces, 1, axis=1)]
+    area = 0.5 * row_lengths(np.cross(edges[:, 0], edges[:, 1]))
+    radius = np.linalg.norm(edges, axis=2).prod(axis=1) / np.maximum(4.0 * area, 1e-300)
+    kept = (radius <= _MAX_RADIUS_RATIO * np.median(radius)) & use[beams[faces]].all(axis=1)
     return np.asarray(beams[faces[kept]], np.int32)
 
 

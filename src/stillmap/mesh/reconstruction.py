@@ -11,26 +11,27 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from stillmap.core.array_types import Float, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.merging import ObjectTrack
-from stillmap.mesh.range_image import Patch
-from stillmap.mesh.registration import (
+from stillmap.mesh.partial_scans import (
     MIN_COMPONENT_AREA,
     PartialScan,
-    PartialSurface,
     extract_partial_scan,
-    motion_transform,
-    register_surfaces,
-    surface_distance,
     triangulate_partial_scan,
     within_time,
 )
-from stillmap.mesh.segmentation import HALF_CAR, DynamicReturns, find_best_interval
+from stillmap.mesh.range_image import Patch
+from stillmap.mesh.registration import (
+    PartialSurface,
+    motion_transform,
+    register_surfaces,
+    surface_distance,
+)
+from stillmap.mesh.returns import HALF_CAR, DynamicReturns, ObjectTrack
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh, subdivide
 from stillmap.mesh.tsdf import integrate_patches
-from stillmap.mesh.types import Float, Index
 
 MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it
 _MAX_VIEW_OFFSET = 0.05  # m of a partial surface from the best one: else it is left out
@@ -50,6 +51,9 @@ _MIN_VIEWS, _MIN_VIEW_SHARE = 1.5, 0.4  # partial surfaces of a voxel, or share 
 _MERGE_DEPTH = 1.0  # m along the line of sight that one of several partial surfaces may bridge
 _MIN_VERTICES = 200  # of the best partial surface: fewer do not tell how others fit
 _MIN_KEPT_SHARE = 0.5  # of the partial surfaces, and of the best one's area
+
+IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid
+_FAR_IMAGE_PENALTY = 4.0  # an interval far from all images counts 1 / (1 + this)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +121,38 @@ def _best_track(
         if len(one.returns):
             scans = returns.inputs.deskewed.scans_of(returns.beam[one.returns])
             seconds = returns.seconds[one.returns]
-            found.append((one, find_best_interval(seconds, scans, duration, shown)))
+            found.append((one, _find_best_interval(seconds, scans, duration, shown)))
     one, (first, last, _) = max(found, key=lambda each: each[1][2])
     return one, (first, last)
+
+
+def _find_best_interval(
+    seconds: Float, scan: Index, duration: float, images: Float
+) -> tuple[float, float, float]:
+    """The interval with most returns on an object, preferably near an image; start, end, score.
+
+    Args:
+        seconds: (n,) times of returns on it, n > 0.
+        scan: (n,) number of the scan, rising.
+        duration: s; 0: one scan.
+        images: (N,) s, when images show the object; an interval `IMAGE_WINDOW` away from all
+            counts one fifth.
+    """
+    if duration == 0.0:
+        ends = np.flatnonzero(np.diff(scan)) + 1
+        a, b = np.concatenate([[0], ends]), np.concatenate([ends, [len(scan)]])
+        first, last = np.minimum.reduceat(seconds, a), np.maximum.reduceat(seconds, a)
+        score = (b - a).astype(np.float64)
+    else:
+        first = np.sort(seconds)
+        at = np.searchsorted(first, first + duration, side="right")
+        last, score = first[at - 1], (at - np.arange(len(first))).astype(np.float64)
+    if len(images):
+        away = np.abs(0.5 * (first + last)[:, None] - images).min(axis=1)
+        penalty = np.minimum(_FAR_IMAGE_PENALTY * away / IMAGE_WINDOW, _FAR_IMAGE_PENALTY)
+        score = score / (1.0 + penalty)
+    best = int(np.argmax(score))
+    return float(first[best]), float(last[best]), float(score[best])
 
 
 def _is_large_enough(mesh: Mesh, area: float) -> bool:
@@ -210,7 +243,9 @@ def _partial_scans(
 
 def _make_surface(scan: PartialScan, now: float) -> PartialSurface:
     mesh = triangulate_partial_scan(scan, True, _MERGE_DEPTH)
-    return PartialSurface.from_mesh(mesh, scan.own.origin.mean(axis=0), 0.5 * sum(scan.span) - now)
+    return PartialSurface.from_mesh(
+        mesh, scan.origin[scan.own].mean(axis=0), 0.5 * sum(scan.span) - now
+    )
 
 
 def _fuse_patches(patches: Sequence[Patch]) -> Mesh:

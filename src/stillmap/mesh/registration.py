@@ -8,30 +8,13 @@ constrain them, as along a side without ends, the track's values hold.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from stillmap.core.array_types import Float
 from stillmap.mesh.range_image import Patch, vertex_normals
-from stillmap.mesh.segmentation import (
-    SPACING,
-    DynamicReturns,
-    ObjectBeams,
-    beams_in_frame,
-    grow_segment,
-    in_viewing_cone,
-    triangulate_beams,
-)
-from stillmap.mesh.tracked_boxes import ObjectFrame
-from stillmap.mesh.triangle_mesh import Mesh, remove_small_components
-from stillmap.mesh.types import Float, Index
-
-MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
-_MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface
-_MAX_EDGE = 0.6  # m, likewise
-_CONTEXT = 0.03  # s around a return in which a scan sees the rest of a car
-_MIN_TRACK_SHARE = 0.1  # of a cluster that a track owns: else another one tracks it
+from stillmap.mesh.triangle_mesh import Mesh
 
 _COARSE_SPEEDS = (0.0, *(s * k for k in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0) for s in (-1.0, 1.0)))  # m/s
 _FINE_SPEEDS = (0.0, *(k * s / 10.0 for k in range(1, 11) for s in (-1.0, 1.0)))  # m/s
@@ -51,20 +34,6 @@ _POINTS = 2000  # of a partial scan, at most
 _MIN_POINTS = 20
 _INDEPENDENT_POINTS = 100.0  # of a partial scan: errors of neighbors are correlated
 _MIN_NORMAL_COSINE = 0.5  # between normals of corresponding points
-
-
-class PartialScan(NamedTuple):
-    """One observation of an object.
-
-    Attributes:
-        own: its beams, in its frame.
-        others: beams near in time that passed it.
-        span: s, from the first to the last.
-    """
-
-    own: ObjectBeams
-    others: ObjectBeams
-    span: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,64 +82,6 @@ class PartialSurface:
         origin = np.tile(self.sensor, (len(points), 1))
         standoff = ((origin - points) * self.normals).sum(axis=1)
         return Patch(points, self.mesh.faces, np.arange(len(points)), origin, standoff)
-
-
-def extract_partial_scan(
-    own: Index, span: tuple[float, float], frame: ObjectFrame, fast: bool, returns: DynamicReturns
-) -> PartialScan | None:
-    """The beams on an object in an interval; None where most belong to another track.
-
-    Args:
-        own: numbers within `returns` of the object's returns, rising.
-        span: s, start and end.
-        frame: of the object.
-        fast: whether all connected dynamic returns are its own.
-        returns: the dynamic returns.
-    """
-    inputs, around = returns.inputs, _CONTEXT if fast else 0.0
-    first, last = span[0] - around, span[1] + around
-    scans, offset = inputs.scans_within(first, last), inputs.deskewed.offset
-    beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = inputs.seconds_of(beams)
-    then = (seconds >= first) & (seconds <= last)
-    beams, seconds = beams[then], seconds[then]
-    mine = within_time(own, returns.seconds, first, last)
-    if fast:
-        there = returns.in_beam_range(int(beams[0]), int(beams[-1]) + 1)
-        every = within_time(np.arange(there.start, there.stop), returns.seconds, first, last)
-        sensor = beams_in_frame(beams[:1], seconds[:1], frame, inputs).origin[0]
-        whole = grow_segment(mine, every, frame, sensor, returns)
-        if not len(whole) or len(mine) < _MIN_TRACK_SHARE * len(whole):
-            return None
-        mine = whole
-        span = float(returns.seconds[mine].min()), float(returns.seconds[mine].max())
-    seen = beams_in_frame(returns.beam[mine], returns.seconds[mine], frame, inputs)
-    beside = ~np.isin(beams, returns.beam[mine], assume_unique=True)
-    beams, seconds = beams[beside], seconds[beside]
-    near = in_viewing_cone(returns.beam[mine], beams, inputs)
-    return PartialScan(seen, beams_in_frame(beams[near], seconds[near], frame, inputs), span)
-
-
-def triangulate_partial_scan(scan: PartialScan, rigid: bool, max_depth: float) -> Mesh:
-    """The surface of a partial scan.
-
-    Args:
-        scan: the beams.
-        rigid: whether the object keeps its shape, as cars do: their sides are seen at grazing
-            incidence.
-        max_depth: metres along the line of sight between beams on the side of a rigid object.
-    """
-    stretch, max_edge = _MAX_SPACING_RATIO, _MAX_EDGE
-    if rigid:
-        away = np.linalg.norm(scan.own.points - scan.own.origin, axis=1)
-        stretch, max_edge = np.inf, max(max_edge, SPACING * float(np.median(away)))
-    mesh = triangulate_beams(scan.own, scan.others, stretch, max_edge, max_depth if rigid else 0.0)
-    return remove_small_components(mesh, MIN_COMPONENT_AREA)
-
-
-def within_time(some: Index, seconds: Float, first: float, last: float) -> Index:
-    """The numbers (n,) whose times lie in an interval."""
-    return some[(seconds[some] >= first) & (seconds[some] <= last)]
 
 
 def motion_transform(motion: Float, time_offset: float) -> tuple[Float, Float]:

@@ -12,11 +12,11 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int32, Int64
 from stillmap.core.camera import project
 from stillmap.core.errors import import_extra
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.triangle_mesh import Mesh, planar_areas, row_lengths, subdivide
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Int64
+from stillmap.mesh.triangle_mesh import Image, Mesh, planar_areas, row_lengths, subdivide
 from stillmap.mesh.views import View
 
 GRAY = (128, 128, 128)  # of faces that no image textures

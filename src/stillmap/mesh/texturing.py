@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.camera import is_in_image, project
 from stillmap.mesh.place import (
     CANDIDATES,
@@ -14,11 +15,9 @@ from stillmap.mesh.place import (
     resolve_assignment,
     sample_buffer,
 )
-from stillmap.mesh.reconstruction import ObjectShape
-from stillmap.mesh.segmentation import IMAGE_WINDOW
+from stillmap.mesh.reconstruction import IMAGE_WINDOW, ObjectShape
 from stillmap.mesh.tracked_boxes import TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.triangle_mesh import Mesh, subdivide
-from stillmap.mesh.types import Bool, Float, Index
 from stillmap.mesh.view_selection import NONE, Candidates, view_utility
 from stillmap.mesh.views import View
 from stillmap.mesh.visibility import DEPTH_SCALE, find_visible_faces, render_depth

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.em import GroundMap
-from stillmap.mesh.types import Bool, Float, Index
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import (
     HOLD,

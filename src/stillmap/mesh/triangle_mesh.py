@@ -5,11 +5,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Index, Int32
 from stillmap.core.errors import import_extra
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import component_labels
-from stillmap.mesh.types import Bool, Float, Index, Int32
+
+Image = NDArray[np.uint8]  # also single colors
+Tell = Callable[[int, int], None]  # called with the work done and the total
+
+
+def no_tell(done: int, total: int) -> None:
+    """Discards progress."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
 from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import import_extra
 from stillmap.core.parallel import map_ordered
@@ -25,14 +26,15 @@ from stillmap.mesh.range_image import (
 )
 from stillmap.mesh.triangle_mesh import (
     Mesh,
+    Tell,
     concatenate_meshes,
+    no_tell,
     remove_small_components,
     simplification_error,
     simplify,
     simplify_to_budget,
     weld,
 )
-from stillmap.mesh.types import Float, Float32, Index, Int32, Int64, Tell, no_tell
 
 _SAMPLED_PATCHES = 8
 _MIN_VOXEL, _MAX_VOXEL = 0.02, 0.2  # m; depth cameras are no more exact than the first

@@ -12,10 +12,10 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import lsqr
 
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.camera import Images, project
 from stillmap.mesh.texture import sample_bilinear
-from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32
+from stillmap.mesh.triangle_mesh import Image, Mesh
 from stillmap.mesh.views import View, read_color_image
 
 NONE = -1

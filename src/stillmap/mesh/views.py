@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.types import Bool, Float, Image, Int64, Tell, no_tell
+from stillmap.mesh.triangle_mesh import Image, Tell, no_tell
 from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED, MAX_TURN_RATE
 
 _MAX_IMAGE_EXTRAPOLATION = 0.1  # s before or after a scan where there is none on the other side

@@ -7,10 +7,10 @@ import numpy as np
 from scipy import ndimage
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.camera import project
 from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN
 from stillmap.mesh.triangle_mesh import Mesh, dot_columns, planar_areas, row_lengths
-from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
 from stillmap.mesh.views import View
 
 DEPTH_SCALE = 0.5  # pixels of the z-buffer per pixel of the image

@@ -10,7 +10,7 @@ from stillmap.core.camera import Camera, Images
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import Background, ViewAssignment
 from stillmap.mesh.point_colors import color_moving
-from stillmap.mesh.segmentation import DynamicReturns
+from stillmap.mesh.returns import DynamicReturns
 from stillmap.mesh.texture import GRAY
 from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh

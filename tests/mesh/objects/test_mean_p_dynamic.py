@@ -8,9 +8,8 @@ from made_up_street import Car, Part, street
 
 from stillmap.mesh import reconstruction
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.merging import collect_tracks
 from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
-from stillmap.mesh.segmentation import DynamicReturns
+from stillmap.mesh.returns import DynamicReturns, collect_tracks
 
 STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
 

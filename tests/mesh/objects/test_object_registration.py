@@ -6,17 +6,16 @@ from made_up_street import Car, Part, street
 
 from stillmap.mesh import reconstruction
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.merging import collect_tracks, merge_tracks
+from stillmap.mesh.merging import merge_tracks
+from stillmap.mesh.partial_scans import PartialScan, triangulate_partial_scan
 from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
 from stillmap.mesh.registration import (
-    PartialScan,
     PartialSurface,
     motion_transform,
     register_surfaces,
     surface_distance,
-    triangulate_partial_scan,
 )
-from stillmap.mesh.segmentation import DynamicReturns, ObjectBeams
+from stillmap.mesh.returns import DynamicReturns, collect_tracks
 from stillmap.mesh.triangle_mesh import Mesh
 
 LATER = (-0.4, -0.2, 0.0, 0.2, 0.4)
@@ -141,9 +140,7 @@ def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
     turn, rise = (a.ravel() for a in np.meshgrid(np.arange(4) * 0.01, np.arange(-3, 4) * 0.01))
     looking = np.stack([np.ones(len(turn)), turn - 0.2, rise], axis=1)
     points = looking * (2.0 / (0.2 - turn))[:, None]  # the plane y = -2
-    zero = np.zeros((len(points), 3))
-    none = ObjectBeams(np.zeros((0, 3)), np.zeros((0, 3)))
-    look = PartialScan(ObjectBeams(points, zero), none, (0.0, 0.0))
+    look = PartialScan(points, np.zeros_like(points), np.ones(len(points), bool), (0.0, 0.0))
     assert len(triangulate_partial_scan(look, True, 3.0)) == 36
     assert len(triangulate_partial_scan(look, False, 3.0)) < 36
     assert len(triangulate_partial_scan(look, True, 0.3)) < 36

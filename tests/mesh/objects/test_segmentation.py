@@ -3,12 +3,7 @@
 import numpy as np
 from made_up_street import Car, Part, street
 
-from stillmap.mesh.segmentation import (
-    DynamicReturns,
-    cluster_cells,
-    grow_segment,
-    segment_object,
-)
+from stillmap.mesh.returns import DynamicReturns, cluster_points, grow_segment, segment_object
 from stillmap.mesh.tracked_boxes import ObjectFrame
 
 TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
@@ -40,11 +35,10 @@ def test_a_part_grows_to_the_whole_and_not_to_the_next_car() -> None:
     assert set(own) <= set(whole)
 
 
-def test_pieces_are_as_far_apart_as_the_link_is_long() -> None:
-    x = np.array([0.0, 0.3, 0.6, 2.0, 2.3])
-    points = np.stack([x, np.zeros(5), np.zeros(5)], axis=1)
-    piece = cluster_cells(points, 0.1, 0.5)
-    assert len(set(piece[:3])) == 1
-    assert len(set(piece[3:])) == 1
-    assert piece[0] != piece[4]
-    assert len(set(cluster_cells(points, 0.1, 1.6))) == 1
+def test_links_are_longer_where_beams_lie_farther_apart() -> None:
+    y = np.array([0.0, 0.3, 0.6, 2.0, 2.3])
+    for away, pieces in ((2.0, 2), (60.0, 1)):
+        points = np.stack([np.full(5, away), y, np.zeros(5)], axis=1)
+        piece = cluster_points(points, np.zeros(3))
+        assert len(set(piece[:3])) == len(set(piece[3:])) == 1
+        assert len(set(piece)) == pieces

@@ -1,0 +1,180 @@
+"""Returns of a recording on moving objects, and which of them each object has."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
+from stillmap.core.square_box import component_labels, neighbor_pairs
+from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
+from stillmap.tracking import MovingObject
+
+NO_OWNER = -1
+LINK = 0.5  # m between connected parts of a vehicle, near the sensor
+SPACING = 0.025  # rad between beams, at most
+HALF_CAR = 3.0  # m, from the center of a car to its ends
+_BOX_MARGIN = 0.15  # m around an object's box within which returns are its own
+_GROUND_CLEARANCE = 0.03  # m above the ground: lower returns are the ground's
+_CAR_LENGTH = 6.0  # m
+_CELLS_PER_LINK = 3.0  # in a cell one point is enough
+
+
+class DynamicReturns(NamedTuple):
+    """The K returns of a recording on moving objects.
+
+    Attributes:
+        inputs: the recording.
+        beam: (K,) beam numbers, rising.
+        seconds: (K,) times, by the clock of boxes.
+        ends: (K, 3) metres in the map frame.
+        owner: (K,) id of the object; -1: none.
+        is_dynamic: (K,) whether P(static) is below one half; not all returns with an owner are.
+    """
+
+    inputs: MeshInputs
+    beam: Index
+    seconds: Float
+    ends: Float
+    owner: Int32
+    is_dynamic: Bool
+
+    @classmethod
+    def collect(cls, inputs: MeshInputs) -> "DynamicReturns":
+        """All returns that are dynamic or belong to an object."""
+        deskewed, objects = inputs.deskewed, inputs.objects
+        owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
+        whose = np.repeat([one.id for one in objects], [len(one.beams) for one in objects])
+        beam = np.union1d(_dynamic_beams(deskewed.hit, inputs.p_static), owned).astype(np.intp)
+        owner = np.full(len(beam), NO_OWNER, np.int32)
+        owner[np.searchsorted(beam, owned)] = whose
+        dynamic = deskewed.hit[beam] & (inputs.p_static[beam] < DYNAMIC_BELOW)
+        seconds, ends = inputs.seconds_of(beam), deskewed.end_points(beam, inputs.poses)
+        return cls(inputs, beam, seconds, ends, owner, dynamic)
+
+    def take(self, numbers: Index | slice) -> "DynamicReturns":
+        """Some of the returns."""
+        parts = {name: getattr(self, name)[numbers] for name in self._fields[1:]}
+        return self._replace(**parts)
+
+    def tracked(self) -> "DynamicReturns":
+        """Dynamic returns on objects that have a box, sorted by time."""
+        boxed = np.isin(self.owner, [one.box.object_id for one in self.inputs.boxes])
+        kept = np.flatnonzero(self.is_dynamic & boxed)
+        return self.take(kept[np.argsort(self.seconds[kept], kind="stable")])
+
+    def in_beam_range(self, first: int, last: int) -> slice:
+        """Returns of beams first:last."""
+        a, b = np.searchsorted(self.beam, [first, last])
+        return slice(int(a), int(b))
+
+
+def _dynamic_beams(hit: Bool, p_static: Float32) -> Index:
+    """Beams that hit something rather dynamic than static, found block by block."""
+    found = [np.zeros(0, np.intp)]
+    for block in arrays.iter_blocks(hit, p_static):
+        dynamic = hit[block] & (p_static[block] < DYNAMIC_BELOW)
+        found.append(block.start + np.flatnonzero(dynamic))
+    return np.concatenate(found)
+
+
+class ObjectTrack(NamedTuple):
+    """A moving object with its returns.
+
+    Attributes:
+        object: as it was tracked.
+        box: box along its track.
+        returns: numbers within `DynamicReturns` of its returns, rising.
+    """
+
+    object: MovingObject
+    box: TrackedBox
+    returns: Index
+
+
+def collect_tracks(returns: DynamicReturns) -> list[ObjectTrack]:
+    """The objects that have a box, each with its returns."""
+    boxes = {one.box.object_id: one for one in returns.inputs.boxes}
+    return [
+        ObjectTrack(one, boxes[one.id], segment_object(one, boxes[one.id], returns))
+        for one in returns.inputs.objects
+        if one.id in boxes
+    ]
+
+
+def segment_object(one: MovingObject, tracked: TrackedBox, returns: DynamicReturns) -> Index:
+    """(n,) returns of an object: rising numbers within `returns`.
+
+    Dynamic returns in the box around it that belong to no other object, and its own not far beside.
+    """
+    box, inputs, offset = tracked.box, returns.inputs, returns.inputs.deskewed.offset
+    stamps = 1e-9 * (inputs.deskewed.stamp_ns - inputs.start_ns)
+    a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
+    b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
+    some = returns.in_beam_range(int(offset[a]), int(offset[b]))
+    half = np.array(box.half_size) + _BOX_MARGIN
+    # returns far from the whole track need no test against the box
+    reach = max(float(np.linalg.norm(half)) + _BOX_MARGIN, HALF_CAR)
+    way = box.center_at(np.concatenate([box.seconds, box.seconds[[0, -1]] + [-box.hold, box.hold]]))
+    low, high = way.min(axis=0) - reach, way.max(axis=0) + reach
+    x, y = returns.ends[some, 0], returns.ends[some, 1]
+    near = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+    near &= (returns.owner[some] == one.id) | (returns.owner[some] == NO_OWNER)
+    number = some.start + np.flatnonzero(near)
+    frame = ObjectFrame.from_track(tracked)
+    at = frame.to_object(returns.seconds[number], returns.ends[number])
+    inside = (np.abs(at[:, :2]) <= half).all(axis=1)
+    inside &= (at[:, 2] > _GROUND_CLEARANCE) & (at[:, 2] <= tracked.height + _BOX_MARGIN)
+    # the track of one person may capture another beside
+    mine = (np.abs(at[:, :2]) <= half + _BOX_MARGIN).all(axis=1)
+    if tracked.is_large and not tracked.is_fast:
+        # the center of the visible part moves about on a large object
+        mine = np.linalg.norm(at[:, :2], axis=1) <= HALF_CAR
+    kept = np.where(returns.owner[number] == one.id, mine, inside)
+    return np.asarray(number[kept], np.intp)
+
+
+def grow_segment(
+    own: Index, within: Index, frame: ObjectFrame, sensor: Float, returns: DynamicReturns
+) -> Index:
+    """(n,) the returns of a fast object and all dynamic returns connected with them.
+
+    Parts of a car are often tracked separately.
+
+    Args:
+        own: numbers within `returns` that are known to be of the object, rising.
+        within: rising numbers of all that may be.
+        frame: of the object.
+        sensor: (3,) metres, sensor position in that frame.
+        returns: all dynamic returns.
+    """
+    within = within[returns.is_dynamic[within]]
+    at = frame.to_object(returns.seconds[within], returns.ends[within])
+    some = (at[:, 2] > _GROUND_CLEARANCE) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR_LENGTH)
+    within, at = within[some], at[some]
+    there = frame.to_object(returns.seconds[own], returns.ends[own])
+    own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR_LENGTH]
+    if not len(within):
+        return own
+    cluster = cluster_points(at, sensor)
+    mine = np.isin(within, own)
+    return np.union1d(own, within[np.isin(cluster, cluster[mine])])
+
+
+def cluster_points(points: Float, sensor: Float) -> Index:
+    """(n,) clusters of points (n, 3), linked up to `LINK` plus the beam spacing at their range.
+
+    Along the line of sight links are longer, and the more so the farther away: sides of cars are
+    seen at grazing incidence.
+
+    Args:
+        points: metres.
+        sensor: (3,) metres.
+    """
+    off = points - sensor
+    # shrunk towards the sensor, so that all links are equally long
+    off *= LINK / (LINK + SPACING * np.linalg.norm(off, axis=1, keepdims=True))
+    cells, of = arrays.unique_cells(np.floor(off * (_CELLS_PER_LINK / LINK)).astype(np.int64))
+    return component_labels(neighbor_pairs(cells, _CELLS_PER_LINK), len(cells))[of]
