@@ -13,14 +13,12 @@ from stillmap.core.grid_map import Region, is_inside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.merging import merge_tracks
+from stillmap.mesh.mover_colors import PointColors, assign_object_views, color_points, times_in_view
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.place import Background, ViewAssignment, assign_views
-from stillmap.mesh.point_colors import PointColors, color_points
 from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
-from stillmap.mesh.returns import DynamicReturns, ObjectTrack, collect_tracks
+from stillmap.mesh.returns import DynamicReturns, ObjectTrack, collect_tracks, merge_tracks
 from stillmap.mesh.texture import TexturedMesh, bake_texture
-from stillmap.mesh.texturing import assign_object_views, times_in_view
 from stillmap.mesh.triangle_mesh import Mesh, Tell
 from stillmap.mesh.tsdf import build_surface
 from stillmap.mesh.view_selection import read_with_gains

@@ -1,17 +1,251 @@
-"""Inputs of the mesh room: a posed and labelled 3D recording and its moving objects."""
+"""Inputs of the mesh room: a posed and labelled 3D recording, its moving objects, and the upright
+boxes along their tracks, which occlude what is behind them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, max_scan_duration_ns
+from stillmap.em import GroundMap
 from stillmap.mesh.range_image import has_planar_scans
-from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking import MovingObject
+from stillmap.tracking.boxes import (
+    HOLD,
+    MAX_OBJECT_HEIGHT,
+    MIN_VEHICLE_LENGTH,
+    Box,
+    fit_box,
+)
+
+OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
+_OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin
+_GROWTHS = (0.0, 1.0, 2.0, 3.0)  # sigmas beyond the margin at which occlusion is evaluated
+_P_IN_BOX = 0.99  # probability that an object is where its box is
+_MIN_RIGID_SIZE = 1.2  # m: objects at least so long or wide are no people
+_MIN_RIGID_SPEED = 2.0  # m/s: faster objects are no people
+_SPEED_QUANTILE = 0.9  # of an object's speeds that counts
+
+
+class TrackedBox(NamedTuple):
+    """An upright box that moves along the track of an object.
+
+    Attributes:
+        box: its footprint over time.
+        bottom: (L,) metres, height of its lower side in the map frame at the times of `box`.
+        height: metres.
+    """
+
+    box: Box
+    bottom: Float
+    height: float
+
+    def motion_until(self, now: float, seconds: Float) -> Float:
+        """(n, 2) metres by which the box moves from times (n,) to a time."""
+        return self.box.center_at(np.array([now])) - self.box.center_at(seconds)
+
+    @property
+    def is_fast(self) -> bool:
+        """True if the speed of the object exceeds that of a pedestrian."""
+        speed = np.linalg.norm(self.box.velocity, axis=1)
+        return bool(np.quantile(speed, _SPEED_QUANTILE) > _MIN_RIGID_SPEED)
+
+    @property
+    def is_large(self) -> bool:
+        """True if the footprint of the object is longer than that of a pedestrian."""
+        return 2.0 * max(self.box.half_size) >= _MIN_RIGID_SIZE
+
+
+def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedBox]:
+    """Boxes along the tracks of objects of a 3D recording."""
+    boxes = []
+    for one in objects:
+        assert one.z is not None
+        height = float(one.size[2])
+        boxes.append(TrackedBox(fit_box(one, start_ns, HOLD), one.z - 0.5 * height, height))
+    return boxes
+
+
+def extrude_boxes(
+    boxes: Sequence[Box], objects: Sequence[MovingObject], ground: GroundMap
+) -> list[TrackedBox]:
+    """Planar boxes of a flat laser with the heights that a second laser measured.
+
+    Args:
+        boxes: planar boxes.
+        objects: moving objects with heights, of the second laser.
+        ground: ground height below the boxes.
+    """
+    heights = {one.id: float(one.size[2]) for one in objects}
+    out = []
+    for box in boxes:
+        is_vehicle = 2.0 * max(box.half_size) >= MIN_VEHICLE_LENGTH
+        min_height = 0.0 if is_vehicle else MAX_OBJECT_HEIGHT
+        height = max(heights.get(box.object_id, 0.0), min_height)
+        out.append(TrackedBox(box, ground.height_at(box.xy), height))
+    return out
+
+
+class ObjectFrame(NamedTuple):
+    """Pose of an object's frame over time: that of its track, with corrections.
+
+    Attributes:
+        box: box along the track.
+        seconds: (S,) times of the corrections, rising; S > 0.
+        offset: (S, 3) corrections of points in the frame of the track: metres ahead and to the
+            left, rad to the left.
+    """
+
+    box: TrackedBox
+    seconds: Float
+    offset: Float
+
+    @classmethod
+    def from_track(cls, box: TrackedBox) -> "ObjectFrame":
+        """The frame of the track, uncorrected."""
+        return cls(box, box.box.seconds[:1], np.zeros((1, 3)))
+
+    def to_object(self, seconds: Float, points: Float) -> Float:
+        """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
+        box = self.box.box
+        center = box.center_at(seconds)
+        heading = box.heading[np.clip(np.searchsorted(box.seconds, seconds, "right") - 1, 0, None)]
+        off = points[:, :2] - center
+        bottom = np.interp(seconds, box.seconds, self.box.bottom)
+        at = np.stack(
+            [
+                (off * heading).sum(axis=1),
+                off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1],
+                points[:, 2] - bottom,
+            ],
+            axis=1,
+        )
+        dx, dy, turn = (np.interp(seconds, self.seconds, column) for column in self.offset.T)
+        c, s = np.cos(turn), np.sin(turn)
+        x, y = c * at[:, 0] - s * at[:, 1] + dx, s * at[:, 0] + c * at[:, 1] + dy
+        return np.stack([x, y, at[:, 2]], axis=1)
+
+    def T_map_object(self, seconds: float) -> Float:
+        """(4, 4) pose of the object's frame at a time."""
+        corners = np.vstack([np.zeros(3), np.eye(3)])
+        at = self.to_object(np.full(4, seconds), corners)
+        T_object_map = np.eye(4)
+        T_object_map[:3, :3] = (at[1:] - at[0]).T
+        T_object_map[:3, 3] = at[0]
+        return np.asarray(np.linalg.inv(T_object_map))
+
+
+class OrientedBox(NamedTuple):
+    """An upright box at one time.
+
+    Attributes:
+        center: (3,) metres in the map frame.
+        heading: (2,) unit vector to the front.
+        half_size: (3,) metres to the front, to the side, upwards.
+    """
+
+    center: Float
+    heading: Float
+    half_size: Float
+
+    def local(self, points: Float) -> Float:
+        """(n, 3) metres ahead, to the left and above the center, of map points (n, 3)."""
+        off = points - self.center
+        ahead = off[:, :2] @ self.heading
+        left = off[:, 1] * self.heading[0] - off[:, 0] * self.heading[1]
+        return np.stack([ahead, left, off[:, 2]], axis=1)
+
+
+def boxes_at(boxes: Sequence[TrackedBox], seconds: float) -> list[OrientedBox]:
+    """The boxes that exist at a time, in seconds of their tracks."""
+    out = []
+    for box, bottom, height in boxes:
+        if max(box.seconds[0] - seconds, seconds - box.seconds[-1]) > box.hold:
+            continue
+        xy = box.center_at(np.array([seconds]))[0]
+        at = max(int(np.searchsorted(box.seconds, seconds, side="right")) - 1, 0)
+        low = float(np.interp(seconds, box.seconds, bottom))
+        center = np.array([*xy, low + 0.5 * height])
+        out.append(OrientedBox(center, box.heading[at], np.array([*box.half_size, 0.5 * height])))
+    return out
+
+
+def occlusion_probability(boxes: Sequence[OrientedBox], position: Float, points: Float) -> Float:
+    """(n,) probability that a box blocks the line of sight from a camera to each point.
+
+    Within `OUTLINE_MARGIN` of a box it is nearly 1; farther out it falls like a normal
+    distribution.
+
+    Args:
+        boxes: at the time of the image.
+        position: (3,) metres, camera center.
+        points: (n, 3) metres.
+    """
+    free = np.ones(len(points))
+    reach = 2.0 * (OUTLINE_MARGIN + _GROWTHS[-1] * _OUTLINE_SIGMA)
+    for one, near, start, ends in _sights_near_boxes(boxes, position, points, reach):
+        shown = np.zeros(len(near))
+        for growth in reversed(_GROWTHS):
+            half_size = one.half_size + OUTLINE_MARGIN + growth * _OUTLINE_SIGMA
+            shown[intersects_box(start, ends, half_size)] = _P_IN_BOX * np.exp(-0.5 * growth**2)
+        free[near] *= 1.0 - shown
+    return 1.0 - free
+
+
+def is_in_or_behind_box(boxes: Sequence[OrientedBox], position: Float, points: Float) -> Bool:
+    """(n,) whether the line of sight from a camera (3,) to points (n, 3) meets a box."""
+    out = np.zeros(len(points), np.bool_)
+    for one, near, start, ends in _sights_near_boxes(boxes, position, points, 0.0):
+        out[near] |= intersects_box(start, ends, one.half_size)
+    return out
+
+
+def _sights_near_boxes(
+    boxes: Sequence[OrientedBox], position: Float, points: Float, reach: float
+) -> Iterator[tuple[OrientedBox, Index, Float, Float]]:
+    """Boxes, the numbers of the points (k,) to which the line of sight passes within `reach` metres
+    of the sphere around the box, and both ends (3,), (k, 3) of these lines in its frame."""
+    along = np.ascontiguousarray((points - position).T)
+    square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
+    for one in boxes:
+        distance = squared_segment_distances(one.center - position, along, square)
+        near = np.flatnonzero(distance <= (float(np.linalg.norm(one.half_size)) + reach) ** 2)
+        if len(near):
+            yield one, near, one.local(position[None])[0], one.local(points[near])
+
+
+def squared_segment_distances(center: Float, along: Float, square: Float) -> Float:
+    """(n,) squared distances from a point (3,) to segments from the origin to `along` (3, n).
+
+    `square` (n,) are their squared lengths.
+    """
+    dot = center[0] * along[0] + center[1] * along[1] + center[2] * along[2]
+    share = np.clip(dot / square, 0.0, 1.0)
+    return np.asarray(center @ center + share * (share * square - 2.0 * dot))
+
+
+def intersects_box(start: Float, ends: Float, half_size: Float) -> Bool:
+    """(n,) whether segments from `start` (3,) to `ends` (n, 3) meet a box around the origin.
+
+    Slab test: a segment lies between each pair of faces over an interval of its length.
+    """
+    enters, leaves = np.full(len(ends), -np.inf), np.full(len(ends), np.inf)
+    for axis in range(3):
+        along = ends[:, axis] - start[axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one = (-half_size[axis] - start[axis]) / along
+            other = (half_size[axis] - start[axis]) / along
+        first, last = np.minimum(one, other), np.maximum(one, other)
+        # parallel to the faces: all of the segment lies between them, or nothing
+        beside = np.inf if abs(start[axis]) > half_size[axis] else -np.inf
+        first[along == 0.0], last[along == 0.0] = beside, -beside
+        enters, leaves = np.maximum(enters, first), np.minimum(leaves, last)
+    return np.asarray((enters <= leaves) & (leaves >= 0.0) & (enters <= 1.0))
+
 
 _SCANS_AROUND = 1  # before and after a time, whose beams may be of it
 _WINDOW = 0.06  # s around an image: longer, and untracked movers smear

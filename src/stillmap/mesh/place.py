@@ -12,9 +12,8 @@ from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.inputs import MeshInputs, boxes_at, is_in_or_behind_box, occlusion_probability
 from stillmap.mesh.texture import sample_bilinear
-from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
 from stillmap.mesh.triangle_mesh import Image, Mesh, Tell, no_tell, subdivide
 from stillmap.mesh.view_selection import (
     Candidates,

@@ -13,23 +13,20 @@ from scipy.spatial import cKDTree
 
 from stillmap.core.array_types import Float, Index
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.inputs import MeshInputs, ObjectFrame, TrackedBox
 from stillmap.mesh.partial_scans import (
     MIN_COMPONENT_AREA,
     PartialScan,
+    PartialSurface,
     extract_partial_scan,
+    motion_transform,
+    register_surfaces,
+    surface_distance,
     triangulate_partial_scan,
     within_time,
 )
 from stillmap.mesh.range_image import Patch
-from stillmap.mesh.registration import (
-    PartialSurface,
-    motion_transform,
-    register_surfaces,
-    surface_distance,
-)
 from stillmap.mesh.returns import HALF_CAR, DynamicReturns, ObjectTrack
-from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh, subdivide
 from stillmap.mesh.tsdf import integrate_patches
 

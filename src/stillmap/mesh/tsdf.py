@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.stride_tricks import sliding_window_view
 
 import stillmap._core as _core
 from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
@@ -251,10 +251,9 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     first = [int(c) * TILE for c in tile]
     metres, weight = volume.dense(first, [TILE + 1] * 3)
     known = weight > min_weight
-    cubes = _reduce_cubes(np.logical_and, known)
-    low = _reduce_cubes(np.minimum, np.where(known, metres, np.inf))
-    high = _reduce_cubes(np.maximum, np.where(known, metres, -np.inf))
-    cubes &= (low < 0.0) & (high >= 0.0) & (high - low <= _MAX_STEP * volume.voxel)
+    corners = sliding_window_view(np.where(known, metres, np.nan), (2, 2, 2))
+    low, high = corners.min(axis=(3, 4, 5)), corners.max(axis=(3, 4, 5))
+    cubes = (low < 0.0) & (high >= 0.0) & (high - low <= _MAX_STEP * volume.voxel)
     if not cubes.any():
         return Mesh.empty()
     # scikit-image tests the mask at the last corner of a cube
@@ -267,14 +266,3 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     mesh = weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
     # vertices are counted from the center of voxel 0
     return Mesh((mesh.vertices + 0.5) * volume.voxel, mesh.faces)
-
-
-def _reduce_cubes(
-    ufunc: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]], values: NDArray[Any]
-) -> NDArray[Any]:
-    """Reduces the eight corners of each cube."""
-    for axis in range(3):
-        low = tuple(slice(None, -1) if d == axis else slice(None) for d in range(3))
-        high = tuple(slice(1, None) if d == axis else slice(None) for d in range(3))
-        values = ufunc(values[low], values[high])
-    return values

@@ -9,7 +9,7 @@ from scipy import ndimage
 import stillmap._core as _core
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.camera import project
-from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN
+from stillmap.mesh.inputs import OUTLINE_MARGIN
 from stillmap.mesh.triangle_mesh import Mesh, dot_columns, planar_areas, row_lengths
 from stillmap.mesh.views import View
 
@@ -173,7 +173,6 @@ _BEAM_DIVERGENCE = 0.01  # m per metre by which the footprint of a return grows
 _SUPPORT_SIGMA = 1.5  # cells over which a static return supports its neighbors
 _MIN_DEPTH = 0.05  # m from the camera: nearer returns are the camera itself
 _MAX_RADIUS = 12  # cells by which a return is dilated
-_CELLS_PER_ROW = 1 << 31  # also outside the image
 
 
 class OcclusionMask(NamedTuple):
@@ -220,61 +219,38 @@ def build_occlusion_mask(view: View, points: Float, p_static: Float32) -> Occlus
     """
     camera = view.camera
     assert camera.K is not None
-    cell = camera.width / _COLUMNS
-    shape = max(round(camera.height / cell), 1), _COLUMNS
+    size = camera.width / _COLUMNS
+    shape = max(round(camera.height / size), 1), _COLUMNS
     local = view.to_camera(points)
     uv, ok = project(camera, local)
     ok &= local[:, 2] > _MIN_DEPTH
-    is_dynamic = p_static < 0.5
-    support = _count_support(uv[ok & ~is_dynamic], cell, shape)
-    depth, dynamic = np.full(shape, np.inf), np.zeros(shape)
-    seen = np.flatnonzero(ok & is_dynamic)
-    seen = seen[_nearest_per_cell(uv[seen] / cell, local[seen, 2])]
-    away = local[seen, 2]
-    radius = (OUTLINE_MARGIN / away + _BEAM_DIVERGENCE) * (float(camera.K[0, 0]) / cell)
-    _draw_discs(depth, dynamic, uv[seen] / cell, away, 1.0 - p_static[seen], radius)
-    return OcclusionMask(cell, depth, dynamic, support)
+    ok[ok] = ((uv[ok] >= 0.0) & (uv[ok] < size * np.array(shape[::-1]))).all(axis=1)
+    column, row = np.floor(uv[ok] / size).astype(np.intp).T
+    away, p_dynamic = local[ok, 2], 1.0 - p_static[ok]
+    static = p_dynamic <= 0.5
+    support = np.zeros(shape)
+    np.add.at(support, (row[static], column[static]), 2.0 * np.pi * _SUPPORT_SIGMA**2)
+    support = ndimage.gaussian_filter(support, _SUPPORT_SIGMA, mode="constant")
+    movers = np.flatnonzero(~static)
+    movers = movers[np.argsort(away[movers], kind="stable")]
+    row, column, away, p_dynamic = row[movers], column[movers], away[movers], p_dynamic[movers]
+    radius = (OUTLINE_MARGIN / away + _BEAM_DIVERGENCE) * (float(camera.K[0, 0]) / size)
+    nearest = _nearest_discs(row, column, np.ceil(np.minimum(radius, _MAX_RADIUS) - 0.5), shape)
+    return OcclusionMask(
+        size, np.append(away, np.inf)[nearest], np.append(p_dynamic, 0.0)[nearest], support
+    )
 
 
-def _count_support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
-    """(h, w) static returns per cell, smoothed; a lone return counts 1 in its own cell."""
-    column, row = np.floor(uv / cell).astype(np.intp).T
-    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-    at = row[inside] * shape[1] + column[inside]
-    count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
-    near = ndimage.gaussian_filter(count.astype(np.float64), _SUPPORT_SIGMA, mode="constant")
-    return np.asarray(near * (2.0 * np.pi * _SUPPORT_SIGMA**2))
-
-
-def _nearest_per_cell(at: Float, away: Float) -> Index:
-    """Numbers of the nearest points (n, 2) of each cell."""
-    column, row = np.floor(at).astype(np.int64).T
-    order = np.argsort(away, kind="stable")
-    _, first = np.unique((row * _CELLS_PER_ROW + column)[order], return_index=True)
-    return order[first]
-
-
-def _draw_discs(
-    depth: Float, dynamic: Float, at: Float, away: Float, p_dynamic: Float32, radius: Float
-) -> None:
-    """Draws discs around dynamic returns; the nearest one wins in each cell.
-
-    Args:
-        depth, dynamic: (h, w), changed.
-        at: (n, 2) in cells.
-        away: (n,) metres ahead of the camera.
-        p_dynamic: (n,).
-        radius: (n,) in cells, at most `_MAX_RADIUS` counts.
-    """
-    h, w = depth.shape
-    whole = np.ceil(np.minimum(radius, _MAX_RADIUS) - 0.5)
+def _nearest_discs(row: Index, column: Index, radius: Float, shape: tuple[int, int]) -> Index:
+    """(h, w) the first of n discs, with a radius in cells, that covers a cell; n: none."""
+    nearest = np.full(shape, len(row))
     steps = np.arange(-_MAX_RADIUS, _MAX_RADIUS + 1)
-    dx, dy = (a.ravel() for a in np.meshgrid(steps, steps))
-    point, step = np.nonzero(dx**2 + dy**2 <= (whole[:, None] + 0.5) ** 2)
-    column, row = np.floor(at[point]).astype(np.intp).T
-    column, row = column + dx[step], row + dy[step]
-    inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
-    cell, point = (row * w + column)[inside], point[inside]
-    order = np.lexsort((point, -away[point]))  # the nearest is written last
-    depth.flat[cell[order]] = away[point[order]]
-    dynamic.flat[cell[order]] = p_dynamic[point[order]]
+    square = steps[:, None] ** 2 + steps**2
+    for r in np.unique(radius).tolist():
+        some = np.flatnonzero(radius == r)[::-1]  # the first is written last
+        centers = np.full(shape, len(row))
+        centers[row[some], column[some]] = some
+        disc = square <= (r + 0.5) ** 2
+        covered = ndimage.minimum_filter(centers, footprint=disc, mode="constant", cval=len(row))
+        nearest = np.minimum(nearest, covered)
+    return nearest

@@ -16,10 +16,9 @@ from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.em import estimate_ground
 from stillmap.mesh import build
 from stillmap.mesh.build import Models
-from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
 from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture import TexturedMesh
-from stillmap.mesh.tracked_boxes import box_objects, extrude_boxes
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.views import View
 from stillmap.pipeline.result import MappingResult

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
-from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.tracked_boxes import TrackedBox
+from stillmap.mesh.inputs import MeshInputs, TrackedBox
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_box
 

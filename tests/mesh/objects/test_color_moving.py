@@ -7,12 +7,11 @@ import pytest
 from recordings import of_one_sensor
 
 from stillmap.core.camera import Camera, Images
-from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.inputs import MeshInputs, TrackedBox
+from stillmap.mesh.mover_colors import color_moving
 from stillmap.mesh.place import Background, ViewAssignment
-from stillmap.mesh.point_colors import color_moving
 from stillmap.mesh.returns import DynamicReturns
 from stillmap.mesh.texture import GRAY
-from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.views import View, read_color_image
 from stillmap.tracking.boxes import Box

@@ -6,16 +6,16 @@ from made_up_street import Car, Part, street
 
 from stillmap.mesh import reconstruction
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.merging import merge_tracks
-from stillmap.mesh.partial_scans import PartialScan, triangulate_partial_scan
-from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
-from stillmap.mesh.registration import (
+from stillmap.mesh.partial_scans import (
+    PartialScan,
     PartialSurface,
     motion_transform,
     register_surfaces,
     surface_distance,
+    triangulate_partial_scan,
 )
-from stillmap.mesh.returns import DynamicReturns, collect_tracks
+from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
+from stillmap.mesh.returns import DynamicReturns, collect_tracks, merge_tracks
 from stillmap.mesh.triangle_mesh import Mesh
 
 LATER = (-0.4, -0.2, 0.0, 0.2, 0.4)

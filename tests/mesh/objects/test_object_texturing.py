@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from made_up_rooms import looking, rectangle
 
-from stillmap.mesh import texturing
+from stillmap.mesh import mover_colors
+from stillmap.mesh.inputs import ObjectFrame, TrackedBox
+from stillmap.mesh.mover_colors import assign_object_views
 from stillmap.mesh.place import Background, ViewAssignment
 from stillmap.mesh.reconstruction import ObjectShape
-from stillmap.mesh.texturing import assign_object_views
-from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import concatenate_meshes
 from stillmap.tracking.boxes import Box
 
@@ -23,8 +23,8 @@ SPEED = 1.0  # m/s along x
 @pytest.fixture(autouse=True)
 def exact_outlines(monkeypatch):
     """Outlines are known exactly."""
-    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.0)
-    monkeypatch.setattr(texturing, "OUTLINE_DRIFT", 0.0)
+    monkeypatch.setattr(mover_colors, "_OUTLINE_INSET", 0.0)
+    monkeypatch.setattr(mover_colors, "OUTLINE_DRIFT", 0.0)
 
 
 def thing(id=3, y=2.0):
@@ -96,8 +96,8 @@ def test_a_thing_is_painted_by_what_shows_it():
 
 
 def test_and_more_of_it_the_farther_it_went(monkeypatch):
-    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.05)
-    monkeypatch.setattr(texturing, "OUTLINE_DRIFT", 0.25)
+    monkeypatch.setattr(mover_colors, "_OUTLINE_INSET", 0.05)
+    monkeypatch.setattr(mover_colors, "OUTLINE_DRIFT", 0.25)
     views, colours = [view(0, 0.0), view(1, 30.0)], pictures()
     still = dress(views, colours=colours)
     went = dress(views, colours=colours, of=shape(0.4))
@@ -109,8 +109,8 @@ def test_what_looks_like_the_place_behind_is_not_painted(monkeypatch):
     x = np.abs(painted_at(found)[:, 0])
     assert 0.02 < x.min() < 0.07
     assert 0.4 < area_painted(found) < 0.46
-    monkeypatch.setattr(texturing, "_MIN_BACKGROUND_DIFFERENCE", 0.0)
-    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 0.0)
+    monkeypatch.setattr(mover_colors, "_MIN_BACKGROUND_DIFFERENCE", 0.0)
+    monkeypatch.setattr(mover_colors, "_UNCERTAIN_INSET", 0.0)
     found = dress([view(0, 0.0), view(1, 30.0)], colours=pictures(gap=0.04))
     assert area_painted(found) == pytest.approx(0.5)
 
@@ -128,5 +128,5 @@ def test_pictures_taken_too_late_do_not_paint(monkeypatch):
     views = [view(0, 0.6), view(1, 30.0)]
     colours = pictures(shift=0.6)
     assert area_painted(dress(views, colours=colours)) == 0.0
-    monkeypatch.setattr(texturing, "IMAGE_WINDOW", 0.7)
+    monkeypatch.setattr(mover_colors, "IMAGE_WINDOW", 0.7)
     assert area_painted(dress(views, colours=colours)) == pytest.approx(0.5)

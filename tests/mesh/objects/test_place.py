@@ -5,9 +5,8 @@ import pytest
 from made_up_rooms import looking, rectangle
 from recordings import of_one_sensor
 
-from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.inputs import MeshInputs, TrackedBox
 from stillmap.mesh.place import _P_UNOBSERVED, p_unoccluded
-from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.view_selection import MIN_P_VISIBLE
 from stillmap.tracking.boxes import Box
 

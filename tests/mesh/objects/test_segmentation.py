@@ -3,8 +3,8 @@
 import numpy as np
 from made_up_street import Car, Part, street
 
+from stillmap.mesh.inputs import ObjectFrame
 from stillmap.mesh.returns import DynamicReturns, cluster_points, grow_segment, segment_object
-from stillmap.mesh.tracked_boxes import ObjectFrame
 
 TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
 

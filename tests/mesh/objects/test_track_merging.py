@@ -5,11 +5,9 @@ import dataclasses
 import numpy as np
 from made_up_street import Car, Part, street
 
-from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.merging import merge_tracks
+from stillmap.mesh.inputs import MeshInputs, TrackedBox
 from stillmap.mesh.reconstruction import reconstruct_object
-from stillmap.mesh.returns import DynamicReturns, collect_tracks
-from stillmap.mesh.tracked_boxes import TrackedBox
+from stillmap.mesh.returns import DynamicReturns, collect_tracks, merge_tracks
 from stillmap.tracking.boxes import fit_box
 
 CAR = Car((6.0, -2.5), (6.0, 0.0))

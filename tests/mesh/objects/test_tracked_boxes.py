@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh import tracked_boxes
-from stillmap.mesh.tracked_boxes import (
+from stillmap.mesh import inputs
+from stillmap.mesh.inputs import (
     OrientedBox,
     TrackedBox,
     boxes_at,
@@ -42,8 +42,8 @@ def test_a_thing_is_on_its_way_and_a_little_beyond() -> None:
 
 @pytest.fixture
 def wide_outlines(monkeypatch):
-    monkeypatch.setattr(tracked_boxes, "OUTLINE_MARGIN", 0.1)
-    monkeypatch.setattr(tracked_boxes, "_OUTLINE_SIGMA", 0.1)
+    monkeypatch.setattr(inputs, "OUTLINE_MARGIN", 0.1)
+    monkeypatch.setattr(inputs, "_OUTLINE_SIGMA", 0.1)
 
 
 @pytest.mark.usefixtures("wide_outlines")

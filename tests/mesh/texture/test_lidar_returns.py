@@ -8,8 +8,7 @@ from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.mesh import inputs
-from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.tracked_boxes import TrackedBox
+from stillmap.mesh.inputs import MeshInputs, TrackedBox
 from stillmap.tracking.boxes import Box
 
 
