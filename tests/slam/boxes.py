@@ -1,15 +1,13 @@
 """Simulated sweeps of a spinning lidar among boxes, with truth."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from recordings import of_one_sensor
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +45,7 @@ class Lidar:
 
 def sweep(
     boxes: Boxes, lidar: Lidar, way: "Way", t: float, rng: np.random.Generator
-) -> tuple[Float, NDArray[np.bool_], Float, NDArray[np.bool_]]:
+) -> tuple[Float, Bool, Float, Bool]:
     """End points (N, 3) in the frame of the lidar as it moves, hits, times, and hits on movers."""
     azimuth, rise = np.meshgrid(
         np.linspace(-np.pi, np.pi, lidar.columns, endpoint=False),
@@ -68,9 +66,7 @@ def sweep(
     return direction * distance[:, None], hit, tau, moving
 
 
-def _cast(
-    boxes: Boxes, origin: Float, beams: Float, times: Float
-) -> tuple[Float, NDArray[np.intp]]:
+def _cast(boxes: Boxes, origin: Float, beams: Float, times: Float) -> tuple[Float, Index]:
     """Distances (N,) to the nearest faces, inf where there are none, and whose they are."""
     nearest, which = np.full(len(beams), np.inf), np.zeros(len(beams), np.intp)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -112,7 +108,7 @@ class Way:
 
 def recorded(
     boxes: Boxes, lidar: Lidar, way: Way, sweeps: int, seed: int, begin: float = 1.0
-) -> tuple[Recording, Float, NDArray[np.float32]]:
+) -> tuple[Recording, Float, Float32]:
     """A recording, the true poses (T, 4, 4) at its stamps, and e of the truth."""
     rng = np.random.default_rng(seed)
     stamps = begin + lidar.period * np.arange(sweeps)
@@ -127,8 +123,3 @@ def recorded(
     )
     truth = way.at(stamps)
     return recording, se2.inverse(truth[0]) @ truth, np.where(moving, 0.0, 1.0).astype(np.float32)
-
-
-def at_once(recording: Recording) -> Recording:
-    """The same without times."""
-    return replace(recording, beam_time=None)

@@ -6,17 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.sim.laser import Movers, cast_beams, compute_beam_angles
 from stillmap.sim.walls import box, pillar, polyline
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-Float = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 ROOMS = {
     "hall with a case": (*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
@@ -38,10 +35,10 @@ def hall() -> Float:
 
 
 @pytest.fixture
-def scan() -> Callable[..., Points]:
+def scan() -> Callable[..., Float32]:
     """Takes one scan: (N, 2) end points in the sensor frame, all round."""
 
-    def take(walls: Float, pose: Float, seed: int = 0, noise: float = 0.01) -> Points:
+    def take(walls: Float, pose: Float, seed: int = 0, noise: float = 0.01) -> Float32:
         angles = compute_beam_angles(240, 2 * np.pi)
         nobody = Movers(
             np.zeros((1, 0, 2)), np.zeros((1, 0)), np.zeros((0, 2)), np.zeros(0, np.int32)
@@ -56,7 +53,7 @@ def scan() -> Callable[..., Points]:
 
 
 @pytest.fixture
-def mapped(scan: Callable[..., Points]) -> Callable[..., _core.OccupancyGrid2D]:
+def mapped(scan: Callable[..., Float32]) -> Callable[..., _core.OccupancyGrid2D]:
     """A map of a room, from scans taken around its origin."""
 
     def build(walls: Float, seed: int = 100, resolution: float = 0.05) -> _core.OccupancyGrid2D:
@@ -75,7 +72,7 @@ def put() -> Callable[..., None]:
     return add
 
 
-def add(grid: _core.OccupancyGrid2D, points: Points, pose: Float, e: float = 1.0) -> None:
+def add(grid: _core.OccupancyGrid2D, points: Float32, pose: Float, e: float = 1.0) -> None:
     n = len(points)
     weights = np.full(n, e, np.float32)
     beams = points, np.ones(n, bool), weights, np.array([0, n]), se2.matrix(*pose)[None]

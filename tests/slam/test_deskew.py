@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.slam import SlamOptions, deskew_recording
-
-Float = NDArray[np.float64]
 
 PERIOD = 0.1
 OPTIONS = SlamOptions()
@@ -25,21 +22,14 @@ TWISTS = {
 }
 
 
-def moved(twist: tuple[float, float, float], seconds: Float) -> Float:
+def moved(twist, seconds):
     """(N, 3, 3) how far a robot in even motion comes in so many seconds (N,)."""
     vx, vy, turn = twist
     rate = np.array([[0.0, -turn, vx], [turn, 0.0, vy], [0.0, 0.0, 0.0]])
     return np.asarray(expm(seconds[:, None, None] * rate))
 
 
-def made(
-    stamps: Float,
-    way: Float,
-    places: list[tuple[float, float, float]],
-    sensor: list[int],
-    times: Float,
-    beams: int = 12,
-) -> tuple[Recording, Float]:
+def made(stamps, way, places, sensor, times, beams=12):
     """A recording of posts that stand around, and where they are: (M, 2) in the map.
 
     Args:
@@ -66,12 +56,7 @@ def made(
     return recording, posts
 
 
-def even(
-    twist: tuple[float, float, float],
-    times: Float,
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    T: int = 5,
-) -> tuple[Recording, Float, Float]:
+def even(twist, times, place=(0.0, 0.0, 0.0), T=5):
     """A robot in even motion; the poses at the stamps, and the posts."""
     stamps = PERIOD * np.arange(T)
     all_times = np.tile(times, T)
@@ -81,7 +66,7 @@ def even(
     return recording, moved(twist, stamps), posts
 
 
-def laid(recording: Recording, poses: Float) -> Float:
+def laid(recording, poses):
     """(M, 2) points in the map, every scan taken at once."""
     T = np.repeat(recording.T_map_sensor(poses), np.diff(recording.offset), axis=0)
     return np.einsum("nij,nj->ni", T[:, :2, :2], recording.points) + T[:, :2, 2]
@@ -180,10 +165,8 @@ def test_leaps_are_no_motion(leap):
 
 def test_equal_stamps_single_scan_and_no_beams():
     recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
-    together = replace(recording, stamp_ns=np.full(5, 10**18))
-    np.testing.assert_array_equal(
-        deskew_recording(together, poses, OPTIONS).points, recording.points
-    )
+    together = deskew_recording(replace(recording, stamp_ns=np.full(5, 10**18)), poses, OPTIONS)
+    np.testing.assert_array_equal(together.points, recording.points)
     one, pose, _ = even((5.0, 0.0, 1.0), np.linspace(-0.1, 0.1, 12), T=1)
     np.testing.assert_array_equal(deskew_recording(one, pose, OPTIONS).points, one.points)
     empty = replace(
@@ -211,18 +194,17 @@ def test_scans_without_beams():
     np.testing.assert_allclose(laid(seen, poses), posts[kept], atol=2e-5)
 
 
-def test_a_drive_that_is_shorter_than_a_scan():
-    """The scans are too close to each other for what they would say about that much time."""
-    stamps, times = np.array([0.0, 0.1, 0.2]), np.tile(np.linspace(0.0, 15.0, 12), 3)
-    poses = se2.matrix(np.array([0.0, 6.0, 6.0]), np.zeros(3), np.zeros(3))
-    recording, _ = made(stamps, np.repeat(poses, 12, axis=0), [(0, 0, 0)], [0, 0, 0], times)
-    seen = deskew_recording(recording, poses, OPTIONS)
-    np.testing.assert_array_equal(seen.points, recording.points)
-
-
-def test_speeds_that_no_robot_reaches():
-    stamps, times = PERIOD * np.arange(3), np.tile(np.linspace(0.0, 0.1, 12), 3)
-    poses = se2.matrix(10.1 * np.arange(3), np.zeros(3), np.zeros(3))
-    recording, _ = made(stamps, np.repeat(poses, 12, axis=0), [(0, 0, 0)], [0, 0, 0], times)
+@pytest.mark.parametrize(
+    ("steps", "seconds"),
+    [
+        ([0.0, 6.0, 6.0], 15.0),  # scans longer than the drive: so near poses do not show the speed
+        ([0.0, 10.1, 20.2], 0.1),  # faster than any robot
+    ],
+)
+def test_steps_that_are_no_motion(steps, seconds):
+    times = np.tile(np.linspace(0.0, seconds, 12), 3)
+    poses = se2.matrix(np.array(steps), np.zeros(3), np.zeros(3))
+    way = np.repeat(poses, 12, axis=0)
+    recording, _ = made(PERIOD * np.arange(3), way, [(0, 0, 0)], [0, 0, 0], times)
     seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_array_equal(seen.points, recording.points)

@@ -1,16 +1,20 @@
-"""Hand-eye calibration on motions that are made up."""
+"""Hand-eye calibration on motions that are made up, and positions from registered poses."""
+
+import dataclasses
 
 import numpy as np
 import pytest
+from driven import chained
+from recordings import of_one_sensor
 
 from stillmap.core import se2
-from stillmap.slam.hand_eye import HandEye, correct_odometry, mirror
+from stillmap.slam.hand_eye import HandEye
+from stillmap.slam.mount_calibration import Calibration, Parameter, refine_positions
 from stillmap.slam.scan_motion import MotionWindows
 
 T = 161
-SECONDS = 0.2 * np.arange(T)
 NOMINAL = {"theta0": 0.0, "x0": 0.0, "y0": 0.0, "scale": 1.0, "rotation_gain": 1.0}
-MOUNTS = {"turned": (np.pi, 0.1, 0.0), "aslant": (-1.2, -0.4, 0.3), "ahead": (0.02, 0.35, 0.0)}
+TURNED, AHEAD = (np.pi, 0.1, 0.0), (0.02, 0.35, 0.0)
 NOISE = (0.003, 0.003, 0.002)
 
 
@@ -23,10 +27,7 @@ def true_path(turns=True):
         steps[8::16, 2] = 0.15
     else:
         steps[:, 0] = 0.1
-    poses = [np.eye(3)]
-    for step in se2.exp(steps):
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
+    return chained(se2.exp(steps))
 
 
 def windows_of(poses, mount, rng, spacing=8):
@@ -42,34 +43,9 @@ def windows_of(poses, mount, rng, spacing=8):
     return MotionWindows(first, last, segment, motion, covariance, steps, np.zeros(0), none)
 
 
-@pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
-@pytest.mark.parametrize("upside_down", [False, True])
-def test_pose_of_a_laser_wherever_it_is(mount, upside_down):
-    poses, rng = true_path(), np.random.default_rng(0)
-    seen = windows_of(poses, mount, rng)
-    problem = HandEye([mirror(seen) if upside_down else seen], [upside_down], poses, NOMINAL)
-    fit = problem.fit_globally(list(NOMINAL))
-    for name, true in zip(("theta0", "x0", "y0"), mount, strict=True):
-        off = fit.values[name] - true
-        off = float(se2.wrap(off)) if name == "theta0" else off
-        assert abs(off) < min(4 * fit.std[name], 0.02), name
-        assert fit.std[name] < 0.01
-
-
-def test_scale_and_gain_are_recorded_over_true():
-    poses, rng = true_path(), np.random.default_rng(1)
-    recorded = correct_odometry(SECONDS, poses, scale=1 / 1.1, rotation_gain=1 / 0.9)
-    problem = HandEye([windows_of(poses, (0, 0, 0), rng)], [False], recorded, NOMINAL)
-    fit = problem.fit(NOMINAL, ["scale", "rotation_gain"])
-    assert fit.values["scale"] == pytest.approx(1.1, abs=0.01)
-    assert fit.values["rotation_gain"] == pytest.approx(0.9, abs=0.01)
-    again = correct_odometry(SECONDS, recorded, scale=1.1, rotation_gain=0.9)
-    np.testing.assert_allclose(again, poses, atol=1e-9)
-
-
 def test_half_a_turn_is_no_negative_scale():
     poses, rng = true_path(), np.random.default_rng(5)
-    problem = HandEye([windows_of(poses, MOUNTS["turned"], rng)], [False], poses, NOMINAL)
+    problem = HandEye([windows_of(poses, TURNED, rng)], [False], poses, NOMINAL)
     assert problem.fit(NOMINAL, list(NOMINAL)).values["scale"] < 0.0
     fit = problem.fit_globally(list(NOMINAL))
     assert fit.values["scale"] == pytest.approx(1.0, abs=0.01)
@@ -78,7 +54,7 @@ def test_half_a_turn_is_no_negative_scale():
 
 def test_outliers_do_not_count():
     poses, rng = true_path(), np.random.default_rng(2)
-    windows = windows_of(poses, MOUNTS["ahead"], rng, spacing=4)
+    windows = windows_of(poses, AHEAD, rng, spacing=4)
     windows.motion[::5] += [0.5, -0.4, 0.6]
     problem = HandEye([windows], [False], poses, NOMINAL)
     fit = problem.fit_globally(list(NOMINAL))
@@ -88,17 +64,38 @@ def test_outliers_do_not_count():
 
 def test_without_turns_the_position_is_unknown():
     poses, rng = true_path(turns=False), np.random.default_rng(3)
-    problem = HandEye([windows_of(poses, MOUNTS["ahead"], rng)], [False], poses, NOMINAL)
+    problem = HandEye([windows_of(poses, AHEAD, rng)], [False], poses, NOMINAL)
     fit = problem.fit_globally(list(NOMINAL))
     assert fit.std["x0"] > 0.2
     assert fit.std["theta0"] < 0.01
 
 
-def test_late_odometry_is_moved_back():
-    poses = true_path()
-    late = correct_odometry(SECONDS, poses, scale=1.0, rotation_gain=1.0, latency=-0.3)
-    again = correct_odometry(SECONDS, late, scale=1.0, rotation_gain=1.0, latency=0.3)
-    inner = slice(4, -4)
-    off = se2.parameters(se2.inverse(poses[inner]) @ again[inner])
-    assert np.abs(off).max() < 0.08  # within one scan's motion at the corners
-    assert np.median(np.abs(off)) < 1e-6
+TRUE = (0.35, -0.05, 0.0)  # x, y, yaw of the laser
+
+
+@pytest.mark.parametrize("significant", [True, False])
+def test_positions_that_were_applied_are_refined(significant):
+    position = {
+        "x": Parameter(0.08, 0.37, 0.02, significant),
+        "y": Parameter(0.0, -0.02, 0.02, significant),
+    }
+    before = Calibration([{"theta": Parameter(0.0, 0.001, 0.002, False), **position}], [False])
+    stamps, none = np.arange(T) * 200_000_000, np.zeros((0, 2), np.float32)
+    recording = dataclasses.replace(
+        of_one_sensor(stamps, np.zeros(T + 1, np.int64), none, np.zeros(0, np.bool_)),
+        T_base_sensor=se2.matrix([0.37], [-0.02], [0.0]),
+        T_odom_base=true_path(),
+    )
+    laser = recording.T_odom_base @ se2.matrix(*TRUE)
+    laser[:, :2, 2] += 0.002 * np.random.default_rng(0).standard_normal((T, 2))
+    registered = laser @ se2.inverse(recording.T_base_sensor[0])
+    after = refine_positions(recording, registered, before)
+    if not significant:
+        assert after is before
+        return
+    x, y = after.lasers[0]["x"], after.lasers[0]["y"]
+    assert x.value == pytest.approx(TRUE[0], abs=0.003)
+    assert y.value == pytest.approx(TRUE[1], abs=0.003)
+    assert max(x.std, y.std) < 0.004
+    assert (x.nominal, x.significant) == (0.08, True)
+    assert after.lasers[0]["theta"] is before.lasers[0]["theta"]

@@ -2,30 +2,23 @@
 
 import math
 
-import numpy as np
 import pytest
+from driven import mapped
 from marks import slow_params
 
 import stillmap
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
-from stillmap.slam import SlamOptions, m_step
 
 SHORT_180 = {"max_range": 6.0}
 NARROW = {"beams": 121, "fov": math.pi / 2, "max_range": 8.0, "range_noise": 0.03}
 SHORTEST = {"max_range": 4.0}
 
 
-def mapped(simulation):
-    recording = simulation.recording
-    e = np.full(recording.n_beams, 0.9, np.float32)
-    return m_step(recording, e, SlamOptions(), None, 1, lambda *_: None, with_grid=False)
-
-
 def assert_held(simulation, ratio):
     """No break, and no worse than that ratio to odometry alone."""
     truth = simulation.truth.T_world_base
-    found = mapped(simulation)
+    found = mapped(simulation.recording)
     assert found.diagnostics.breaks == []
     of_odometry = compute_absolute_errors(simulation.recording.T_odom_base, truth).rmse
     assert compute_absolute_errors(found.poses, truth).rmse < ratio * of_odometry

@@ -47,16 +47,19 @@ def assert_same(one, other):
 def test_removal_is_exact():
     poses = hall().truth.T_world_base
     e = np.random.default_rng(0).random(hall().recording.n_beams).astype(np.float32)
-    all_of_it, rest = empty(e), empty(e)
+    whole, with_late, early, late = (empty(e) for _ in range(4))
     for t in range(0, 120, 4):
-        all_of_it.add(t, poses[t], 0.1 * t)
-        if t >= 60:
-            rest.add(t, poses[t], 0.1 * t)
-    all_of_it.remove_before(6.0)
-    assert_same(all_of_it.grid, rest.grid)
-    assert_same(rest.grid, all_of_it.grid)
-    all_of_it.remove_before(np.inf)
-    assert not any(sums.any() for sums in all_of_it.grid.dense()[1:])
+        for part in (whole, with_late, early if t < 60 else late):
+            part.add(t, poses[t], 0.1 * t)
+    whole.remove_before(6.0)
+    assert_same(whole.grid, late.grid)
+    assert_same(late.grid, whole.grid)
+    whole.remove_before(np.inf)
+    assert not any(sums.any() for sums in whole.grid.dense()[1:])
+    with_late.remove_since(60)
+    assert_same(early.grid, with_late.grid)
+    with_late.remove_since(0)
+    assert not with_late.has_sensor(0)
 
 
 @pytest.mark.parametrize(
@@ -78,19 +81,6 @@ def test_scans_are_spaced(monkeypatch, move, kept):
     so_far.add(1, se2.matrix(*move), 0.2)
     before, after = (one.grid.dense()[1].sum() for one in (first, so_far))
     assert (after > before) == kept
-
-
-def test_remove_since():
-    T = hall().truth.T_world_base
-    one, other = empty(), empty()
-    for t in range(0, 60, 5):
-        other.add(t, T[t], 0.1 * t)
-        if t < 30:
-            one.add(t, T[t], 0.1 * t)
-    other.remove_since(30)
-    assert_same(one.grid, other.grid)
-    other.remove_since(0)
-    assert not other.has_sensor(0)
 
 
 def test_sensors_are_spaced_separately():

@@ -4,12 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from driven import loop_context
 from recordings import of_one_sensor
 
 from stillmap.core import se2
-from stillmap.slam import (
-    SlamOptions,
-)
+from stillmap.slam import SlamOptions
 from stillmap.slam.loop_candidates import (
     graph_distances,
     odometry_constraints,
@@ -18,7 +17,7 @@ from stillmap.slam.loop_candidates import (
     view_centers,
 )
 from stillmap.slam.loop_closure import reject_inconsistent, reject_inconsistent_since
-from stillmap.slam.types import LoopClosure, LoopContext
+from stillmap.slam.types import LoopClosure
 
 OPTIONS = SlamOptions()
 # as sure as 5 m of travel
@@ -31,18 +30,7 @@ def make_context(poses):
     recording = of_one_sensor(
         np.arange(n), np.zeros(n + 1, np.int64), np.zeros((0, 2), np.float32), np.zeros(0, bool)
     )
-    return LoopContext(
-        recording,
-        np.zeros(0, np.float32),
-        poses,
-        np.arange(float(n)),
-        np.ones(n),
-        np.arange(n),
-        0.05,
-        1.0,
-        6.0,
-        np.zeros((n, 3, 3)),
-    )
+    return loop_context(recording, poses, np.arange(float(n)), np.arange(n))
 
 
 def straight(n):
@@ -60,21 +48,20 @@ def tie(earlier, later, covariance=SURE, T=None):
 
 def test_drift_of_candidates_follows_the_graph():
     context = laps(3)
-    closures = [tie(k, 21 + k) for k in range(21)]
+
+    def proposed(closures):
+        centers = view_centers(context)
+        found = propose_candidates(context, context.poses, centers, 42, 63, closures)
+        return {candidate.later: candidate for candidate in found}
+
     # third lap: as uncertain as the way from its start
-    third = {
-        c.later: c
-        for c in propose_candidates(context, context.poses, view_centers(context), 42, 63, closures)
-    }
+    third = proposed([tie(k, 21 + k) for k in range(21)])
     assert set(third) == set(range(42, 63))
     for later, candidate in third.items():
         assert candidate.drift_distance <= later - 42 + 1 + 20 + 5
         assert candidate.drift_distance <= later - candidate.earlier
-    alone = {
-        c.later: c
-        for c in propose_candidates(context, context.poses, view_centers(context), 42, 63, [])
-    }
-    assert alone[50].drift_distance == 50 - alone[50].earlier
+    alone = proposed([])[50]
+    assert alone.drift_distance == 50 - alone.earlier
 
 
 def test_candidates_use_corrected_poses():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boxes import Boxes, Lidar, Way, recorded
+from driven import chained, silent
 
 from stillmap.core import se2, se3
 from stillmap.results.eval.trajectory import compute_absolute_errors
@@ -39,27 +40,20 @@ def round_the_block():
 def drive():
     """A recording, its true poses, e, and what odometry without any error would find."""
     recording, truth, e = recorded(block(), LIDAR, round_the_block(), 200, seed=1)
-    driven = lidar_odometry.register_sweeps(recording, e, OdometryOptions(), _silent, 1)
+    driven = lidar_odometry.register_sweeps(recording, e, OdometryOptions(), silent, 1)
     assert compute_absolute_errors(driven.poses, truth).rmse < 0.1
     return recording, truth, e, driven
-
-
-def _silent(*_):
-    pass
 
 
 def drifted(driven, per_step):
     """The same poses, every step off by a twist (6,)."""
     steps = se2.inverse(driven.poses[:-1]) @ driven.poses[1:] @ se3.exp(np.asarray(per_step))
-    poses = [driven.poses[0]]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return replace(driven, poses=np.array(poses))
+    return replace(driven, poses=driven.poses[0] @ chained(steps))
 
 
 def closed(drive, driven):
     recording, _, e, _ = drive
-    return loop_closure_3d.close_loops_3d(recording, e, SlamOptions(), driven, _silent, 1)
+    return loop_closure_3d.close_loops_3d(recording, e, SlamOptions(), driven, silent, 1)
 
 
 @pytest.mark.slow

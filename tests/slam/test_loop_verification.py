@@ -81,11 +81,9 @@ def street():
 def test_loops_close_across_a_street():
     context = street()
     looks = loop_candidates.view_centers(context)
-    asked = list(
-        loop_candidates.propose_candidates(
-            context, context.poses[context.keyframes], looks, 0, len(looks), []
-        )
-    )
+    keyframes = context.poses[context.keyframes]
+    every = context, keyframes, looks, 0, len(looks), []
+    asked = list(loop_candidates.propose_candidates(*every))
     # never nearer than that
     assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if context.travelled[c.later] > 90.0) > 9.9
     found = [c for c in verify_candidates(context, asked) if not c.rejected]

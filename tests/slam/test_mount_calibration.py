@@ -52,27 +52,21 @@ def test_nothing_is_wrong():
         assert abs(laser[name].value - true) < 4 * laser[name].std < 0.1
 
 
-def test_a_laser_that_faces_backwards():
-    found = calibrate_mounts(recorded_as(office(math.pi), *LASER), RESOLUTION)
-    assert significant(found) == {"theta"}
-    assert abs(se2.wrap(found.lasers[0]["theta"].value - math.pi)) < 0.02
-
-
-def test_a_laser_upside_down():
-    found = calibrate_mounts(mirror_beams(office(), 0), RESOLUTION)
-    assert significant(found) == {"upside_down"}
-
-
-def test_a_laser_off_centre():
-    found = calibrate_mounts(recorded_as(office(), 0.08, -0.3, 0.0), RESOLUTION)
-    assert significant(found) == {"x", "y"}
-    assert found.lasers[0]["y"].value == pytest.approx(0.0, abs=0.02)
-
-
-def test_a_laser_aslant():
-    found = calibrate_mounts(recorded_as(office(), 0.08, 0.0, math.radians(10)), RESOLUTION)
-    assert significant(found) == {"theta"}
-    assert found.lasers[0]["theta"].value == pytest.approx(0.0, abs=0.01)
+@pytest.mark.parametrize(
+    ("yaw", "recorded", "names", "true"),
+    [
+        (math.pi, LASER, {"theta"}, math.pi),  # it faces backwards
+        (0.0, (0.08, -0.3, 0.0), {"x", "y"}, 0.0),
+        (0.0, (0.08, 0.0, math.radians(10)), {"theta"}, 0.0),
+    ],
+)
+def test_a_laser_that_sits_elsewhere(yaw, recorded, names, true):
+    found = calibrate_mounts(recorded_as(office(yaw), *recorded), RESOLUTION)
+    assert significant(found) == names
+    laser = found.lasers[0]
+    assert abs(se2.wrap(laser["theta"].value - true)) < 0.02
+    if "y" in names:
+        assert laser["y"].value == pytest.approx(0.0, abs=0.02)
 
 
 def test_what_is_told_stays():
@@ -81,6 +75,7 @@ def test_what_is_told_stays():
     assert found.lasers == [{}]
     assert "theta" not in significant(found)
     mirrored = mirror_beams(office(), 0)
+    assert significant(calibrate_mounts(mirrored, RESOLUTION)) == {"upside_down"}
     assert not calibrate_mounts(mirrored, RESOLUTION, [("upside_down",)]).upside_down[0]
 
 

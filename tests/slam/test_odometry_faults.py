@@ -2,28 +2,17 @@
 
 import dataclasses
 import functools
-from itertools import accumulate
 
 import numpy as np
 import pytest
+from driven import ate, chained, mapped, picked, prior, silent
 from marks import slow_params
 from rooms import drive
 
 from stillmap.core import se2
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
-from stillmap.slam import SlamOptions, m_step, odometry_2d
-
-OPTIONS = SlamOptions()
-
-
-def silent(*_):
-    """Ignores progress."""
-
-
-def followed(recording):
-    e = np.full(recording.n_beams, 0.9, np.float32)
-    return odometry_2d.register_scans(recording, e, OPTIONS, silent)
+from stillmap.slam import SlamOptions, odometry_2d
 
 
 @functools.cache
@@ -35,8 +24,8 @@ def room():
 def survived(T_odom_base):
     """The scans where odometry was disbelieved; poses are as good as ever."""
     recording = dataclasses.replace(room().recording, T_odom_base=T_odom_base)
-    found = followed(recording)
-    assert compute_absolute_errors(found.poses, room().truth.T_world_base).rmse < 0.01
+    found = odometry_2d.register_scans(recording, prior(recording), SlamOptions(), silent)
+    assert ate(found, room().truth) < 0.01
     assert found.diagnostics.breaks == []
     return found.diagnostics.odometry_faults
 
@@ -44,10 +33,6 @@ def survived(T_odom_base):
 def steps():
     T = room().recording.T_odom_base
     return se2.inverse(T[:-1]) @ T[1:]
-
-
-def chained(steps):
-    return np.array([*accumulate(steps, np.matmul, initial=np.eye(3))])
 
 
 def test_valid_odometry_is_accepted():
@@ -63,24 +48,16 @@ def test_odometry_restart(origin):
     assert survived(T) == [30]
 
 
-def test_slip_while_turning():
-    turn = room().truth.T_world_base[[44, 62]]
-    assert abs(se2.parameters(se2.inverse(turn[0]) @ turn[1])[2]) > np.radians(80)
+@pytest.mark.parametrize(("first", "last", "least"), [(44, 62, 10), (15, 40, 20)])
+def test_slip_while_turning_and_while_driving(first, last, least):
+    before, after = room().truth.T_world_base[[first, last]]
+    x, y, turn = se2.parameters(se2.inverse(before) @ after)
+    assert np.hypot(x, y) > 2.0 or abs(turn) > np.radians(80)
     moved = steps()
-    moved[44:62] = np.eye(3)
+    moved[first:last] = np.eye(3)
     disagreeing = survived(chained(moved))
-    assert len(disagreeing) >= 10
-    assert set(disagreeing) <= set(range(45, 63))
-
-
-def test_slip_while_driving():
-    way = room().truth.T_world_base[[15, 40]]
-    assert np.linalg.norm(way[1] - way[0]) > 2.0
-    moved = steps()
-    moved[15:40] = np.eye(3)
-    disagreeing = survived(chained(moved))
-    assert len(disagreeing) >= 20
-    assert set(disagreeing) <= set(range(16, 41))
+    assert len(disagreeing) >= least
+    assert set(disagreeing) <= set(range(first + 1, last + 1))
 
 
 @pytest.mark.parametrize("times", [3.5, 0.0, -1.0], ids=["spinning", "blocked", "backwards"])
@@ -90,25 +67,8 @@ def test_wrong_wheel_odometry(times):
     assert survived(chained(se2.matrix(*moved.T))) == list(range(21, 31))
 
 
-def picked(recording, scans):
-    """Some of the scans of a recording, as often as they are named."""
-    beams = np.concatenate([np.r_[recording.beams_of(t)] for t in scans])
-    in_order = bool(np.all(np.diff(scans) > 0))
-    return dataclasses.replace(
-        recording,
-        stamp_ns=recording.stamp_ns[scans if in_order else slice(len(scans))],
-        offset=np.concatenate([[0], np.cumsum(np.diff(recording.offset)[scans])]),
-        points=recording.points[beams],
-        hit=recording.hit[beams],
-        sensor=recording.sensor[scans],
-        T_odom_base=recording.T_odom_base[scans],
-    )
-
-
 def error(recording, T_world_base):
-    e = np.full(recording.n_beams, 0.9, np.float32)
-    found = m_step(recording, e, OPTIONS, None, 1, silent)
-    return compute_absolute_errors(found.poses, T_world_base).rmse
+    return compute_absolute_errors(mapped(recording).poses, T_world_base).rmse
 
 
 @functools.cache
@@ -134,7 +94,7 @@ def two_lasers(seed, both):
         "laser": {"second_laser": both, "beams": 120},
     }
     simulation = simulate(scene_by_name("hall", options), seed)
-    return error(simulation.recording, simulation.truth.T_world_base)
+    return ate(mapped(simulation.recording), simulation.truth)
 
 
 @pytest.mark.slow
@@ -148,5 +108,4 @@ def test_two_lasers_without_odometry(seed):
 def test_two_lasers_without_overlap_or_odometry(seed):
     options = {"robot": {"scans": 800}, "laser": {"second_laser": True}}
     simulation = simulate(scene_by_name("office", options), seed)
-    recording = simulation.recording.without_odometry()
-    assert error(recording, simulation.truth.T_world_base) < 0.04
+    assert ate(mapped(simulation.recording.without_odometry()), simulation.truth) < 0.04

@@ -4,20 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from driven import ate, mapped
 from marks import slow_params
 from rooms import drive
 
 from stillmap.core import se2
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
-from stillmap.slam import SlamOptions, m_step
-
-OPTIONS = SlamOptions()
-
-
-def mapped(recording, options=OPTIONS):
-    e = np.full(recording.n_beams, 0.9, np.float32)
-    return m_step(recording, e, options, None, 1, lambda *_: None)
 
 
 def carried(world, seed, beams, **robot):
@@ -29,7 +22,7 @@ def assert_noticed_and_placed(simulation):
     found = mapped(simulation.recording)
     assert found.diagnostics.breaks == [simulation.truth.scene["carried_at_scan"]]
     assert found.diagnostics.unconnected == []
-    assert compute_absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
+    assert ate(found, simulation.truth) < 0.1
 
 
 @pytest.mark.slow
@@ -42,16 +35,20 @@ def test_kidnapped_robot_is_relocalized(seed):
     assert_noticed_and_placed(simulation)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
-def test_relocalization_in_an_office(seed):
-    assert_noticed_and_placed(carried("office", seed, 180, scans=1500, carried_at=0.6))
+OFFICE = {"scans": 1500, "carried_at": 0.6}
+WAREHOUSE = {"scans": 900, "speed": 1.0, "carried_at": 0.6}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_relocalization_in_a_warehouse(seed):
-    assert_noticed_and_placed(carried("warehouse", seed, 120, scans=900, speed=1.0, carried_at=0.6))
+@pytest.mark.parametrize(
+    ("world", "seed", "beams", "robot"),
+    [
+        *(("office", seed, 180, OFFICE) for seed in range(5)),
+        *(("warehouse", seed, 120, WAREHOUSE) for seed in range(3)),
+    ],
+)
+def test_relocalization_in_large_places(world, seed, beams, robot):
+    assert_noticed_and_placed(carried(world, seed, beams, **robot))
 
 
 @pytest.mark.slow
