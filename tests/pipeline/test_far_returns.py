@@ -48,7 +48,7 @@ def test_a_result_knows_its_recording(short, tmp_path):
     np.testing.assert_array_equal(opened.recording.points, result.recording.points)
     assert not opened.recording.hit[::3].any()
     other = dataclasses.replace(spoiled, hit=np.arange(len(spoiled.hit)) % 3 == 0)
-    with pytest.raises(stillmap.InputError, match="other beams hit something"):
+    with pytest.raises(stillmap.InputError, match="is not the recording that was mapped"):
         _ = stillmap.load(out, recording=other).recording
 
 

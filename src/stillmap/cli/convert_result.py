@@ -114,7 +114,7 @@ def _convert_to_nav2(
     is_traffic = rule.keepout is not None or rule.slow is not None
     crossings = read_crossings(result.folder) if is_traffic else None
     maps = nav2.make_maps(read_grid(result.folder), drawn, rule, crossings)
-    nav2.write(maps, output, result.options.output.map_mode, overwrite=args.overwrite)
+    nav2.write(maps, output, result.output_options.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
         written.append(f"keep-out zones of {maps.keepout_area:.1f} m2")
@@ -224,9 +224,9 @@ def _build_cloud(
             hint=f"{_PARQUET} holds the end points of its beams",
         )
     poses = result.read_poses(recording)
-    deskewed = deskew_recording(recording, poses, result.options.slam)
+    deskewed = deskew_recording(recording, poses, result.slam_options)
     colors = read_colors(result.folder, recording.n_beams)
-    deskewed = limit_hits(deskewed, poses, result.options.output.region)
+    deskewed = limit_hits(deskewed, poses, result.output_options.region)
     return point_cloud.cloud_from_recording(
         recording,
         deskewed,

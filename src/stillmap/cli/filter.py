@@ -219,7 +219,7 @@ def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget
     poses = result.read_poses(recording)
     recording = result.calibrate(recording)
     if not target.marker:
-        recording = deskew_recording(recording, poses, result.options.slam)
+        recording = deskew_recording(recording, poses, result.slam_options)
     return dataclasses.replace(recording, T_recorded_base=poses)
 
 

@@ -174,4 +174,4 @@ def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
         recording, labels = result.read(progress)
     recording = result.calibrate(recording)
     poses = result.read_poses(recording)
-    return Beams(recording, labels.p_static, poses, result.options.slam)
+    return Beams(recording, labels.p_static, poses, result.slam_options)

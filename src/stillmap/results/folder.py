@@ -3,7 +3,6 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,11 @@ from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.options import Options, OutputOptions
 from stillmap.prepare.options import ReadOptions
 from stillmap.results.reader import LOCAL_ORIGIN, RECORD, Labels, is_result, read_labels, read_run
 from stillmap.results.run_json import read_calibration
+from stillmap.slam import SlamOptions
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,34 @@ class ResultFolder(ShortRepr):
         """Of the record."""
         return self.folder / RECORD
 
-    @cached_property
+    @property
     def options(self) -> Options:
         """Every option as it was resolved for the map; the default where the record has none.
 
         Raises:
             InputError: the record has options that this version does not know.
         """
+        return self._resolve(self.record.get("options") or {})
+
+    @property
+    def slam_options(self) -> SlamOptions:
+        """The options that deskew its recording as it was deskewed for the map."""
+        return self._resolve(self._section("slam", "deskew")).slam
+
+    @property
+    def output_options(self) -> OutputOptions:
+        """Region and mode of its map, and defaults."""
+        return self._resolve(self._section("output", "region", "map_mode")).output
+
+    def _section(self, name: str, *keys: str) -> dict[str, Any]:
+        """Some entries of a section of the options in the record, those that are there."""
+        section = (self.record.get("options") or {}).get(name)
+        return {name: {key: section.get(key) for key in keys}} if isinstance(section, dict) else {}
+
+    def _resolve(self, changes: dict[str, Any]) -> Options:
+        """The default options with those of the record that are set."""
         try:
-            return config.override(Options(), _drop_unset(self.record.get("options") or {}))
+            return config.override(Options(), _drop_unset(changes))
         except InputError as error:
             where = str(self.folder)
             raise InputError(f"has options that cannot be: {error}", where=where) from error
@@ -70,9 +89,10 @@ class ResultFolder(ShortRepr):
         Raises:
             InputError: the record does not say so.
         """
-        if "read" not in (self.record.get("options") or {}):
+        noted = self.record.get("options") or {}
+        if "read" not in noted:
             raise InputError("names no options", where=str(self.path))
-        return self.options.read
+        return self._resolve({"read": noted["read"]}).read
 
     def read_frame(self, name: str = LOCAL_ORIGIN) -> LocalFrame:
         """The frame whose origin (3,) is an entry of the record, in which it was computed unless
@@ -219,7 +239,7 @@ def read_region(result: Path) -> Region | None:
     """
     if not is_result(result):
         return None
-    return ResultFolder(result, read_run(result)).options.output.region
+    return ResultFolder(result, read_run(result)).output_options.region
 
 
 def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:

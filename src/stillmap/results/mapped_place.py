@@ -182,7 +182,7 @@ class MappedPlace:
         """The recording without the motion during its scans, computed at every call."""
         if self.mapping is not None:
             return self.mapping.deskewed
-        return deskew_recording(self.recording, self.poses, self.options.slam)
+        return deskew_recording(self.recording, self.poses, self.loaded.slam_options)
 
     @cached_property
     def colors(self) -> NDArray[np.uint8] | None:

@@ -118,7 +118,7 @@ def _write_static_points(
 ) -> None:
     """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
     programs expect coordinates of 32 bits."""
-    seen = limit_hits(deskewed, result.poses, result.options.output.region)
+    seen = limit_hits(deskewed, result.poses, result.loaded.output_options.region)
     cloud = cloud_from_recording(
         result.recording, seen, result.poses, result.p_static, "static", result.colors
     )
