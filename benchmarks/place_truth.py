@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from session_overlap import compute_overlap, observe
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
 from stillmap.io import stillmap_folder
-from stillmap.sim.planner import Float
 from stillmap.sim.session_layout import ObjectKind, Place, StandingObject
 from stillmap.sim.sessions import SESSIONS_FILE, TrueChange
 from stillmap.sim.truth import Truth, load_truth

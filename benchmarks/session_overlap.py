@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
-from stillmap.sim.planner import Float
 from stillmap.sim.truth import Truth
 
 _CELL, _CELL_3D = 0.1, 0.5  # m, of the area that counts as observed

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from session_overlap import compute_overlap, observe
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.sim import Scene, scene_by_name
-from stillmap.sim.planner import Float
 from stillmap.sim.sessions import (
     DrawRoute,
     SessionPlan,

@@ -5,10 +5,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
@@ -53,7 +53,7 @@ class CorrectedRecording(NamedTuple):
 
 
 def correct_recording(
-    recording: Recording, options: Options, poses: NDArray[np.float64] | None
+    recording: Recording, options: Options, poses: Float | None
 ) -> CorrectedRecording:
     """Leave out what cannot be, time sweeps, and calibrate; poses (T, D+1, D+1): those to keep."""
     cell = options.slam.resolution

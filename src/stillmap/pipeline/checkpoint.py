@@ -21,6 +21,7 @@ from pydantic import ConfigDict, TypeAdapter
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core.array_folder import open_npy, read_record, write_arrays
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import iter_bytes
 from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError, cannot_write
@@ -216,9 +217,7 @@ def _require_fit(state: EmState, recording: Recording) -> None:
             raise ValueError("poses or labels of another recording")
 
 
-def identify_run(
-    recording: Recording, options: Options, poses: NDArray[np.float64] | None
-) -> dict[str, Any]:
+def identify_run(recording: Recording, options: Options, poses: Float | None) -> dict[str, Any]:
     """The key of a run: its version, options, and a hash of the arrays of its input."""
     names = ("stamp_ns", "offset", "points", "hit", "beam_time", "T_base_sensor", "sensor")
     arrays = (*(getattr(recording, name) for name in names), recording.T_odom_base, poses)

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
@@ -49,7 +49,7 @@ def find_warnings(
     return out
 
 
-def find_map_warnings(maps: Maps, recording: Recording, poses: NDArray[np.float64]) -> list[str]:
+def find_map_warnings(maps: Maps, recording: Recording, poses: Float) -> list[str]:
     """That the map leaves out what is far from most of the place: one sentence, or none.
 
     Args:

@@ -5,17 +5,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stillmap import em, slam
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.pipeline.estimate import Estimate, Iteration, IterationRecord
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
-
-Float = NDArray[np.float64]
 
 _MAX_REFINED_SHARE = 0.2  # of the scans with changed labels: if more, all are matched anew
 
@@ -77,7 +73,7 @@ def label_poses(
     recording: Recording,
     options: Options,
     number: int,
-    e: NDArray[np.float32],
+    e: Float32,
     m_step: slam.MStepResult,
     stages: StageTimer,
     started: float,
@@ -122,7 +118,7 @@ def label_poses(
 
 def _m_step(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     before: Estimate | None,
     options: Options,
     poses: Float | None,

@@ -5,16 +5,15 @@ import logging
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em, slam
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.snapshots import Snapshot, Window, choose_window, snapshot
 
-Float = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 # of the scans: if fewer are touched by a change of labels, the next M-step finds the same poses
@@ -35,7 +34,7 @@ class Estimate(ShortRepr):
     """
 
     number: int
-    weights: NDArray[np.float32]
+    weights: Float32
     m_step: slam.MStepResult
     e_step: em.EStepResult
 
@@ -45,7 +44,7 @@ class Estimate(ShortRepr):
         return self.m_step.poses
 
     @property
-    def p_static(self) -> NDArray[np.float32]:
+    def p_static(self) -> Float32:
         """(M,) P(c = 1)."""
         return self.e_step.p_static
 

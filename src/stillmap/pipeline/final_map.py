@@ -4,10 +4,10 @@ import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em, slam
+from stillmap.core.array_types import Float, Index, Int64
 from stillmap.core.parallel import resolve_threads, trim_heap
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
@@ -56,7 +56,7 @@ class Maps(ShortRepr):
     raw: em.OccupancyMap
     evidence: em.Coverage
     ground: GroundMap | None
-    beyond: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    beyond: Float = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def final_estimate(
@@ -100,7 +100,7 @@ def _find_doors(
     deskewed: Recording,
     best: Estimate,
     courses: em.CellHistories,
-    surface: NDArray[np.int64],
+    surface: Int64,
     cell: float,
     look: float,
 ) -> list[Change]:
@@ -201,7 +201,7 @@ def _project(
 
 def _occupancy_maps(
     planar: Recording, estimate: Estimate, options: Options, threads: int
-) -> tuple[em.OccupancyMap, em.OccupancyMap, NDArray[np.float64]]:
+) -> tuple[em.OccupancyMap, em.OccupancyMap, Float]:
     """The map, the same cells with every hit counted as static, and places with hits outside.
 
     Labels that follow from the sums go with the weights that made the sums; others make them.
@@ -220,7 +220,7 @@ def _occupancy_maps(
     return filtered, raw, em.find_hits_beyond(grid, filtered.window)
 
 
-def _wanted_places(planar: Recording, estimate: Estimate, options: Options) -> NDArray[np.float64]:
+def _wanted_places(planar: Recording, estimate: Estimate, options: Options) -> Float:
     """(K, 2) m, around which a map lies that cannot be whole: the region, or all sensors."""
     if options.output.region is not None:
         x0, y0, x1, y1 = options.output.region
@@ -249,7 +249,7 @@ def find_objects(
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 
 
-def _is_change(one: MovingObject, changed: NDArray[np.intp], recording: Recording) -> bool:
+def _is_change(one: MovingObject, changed: Index, recording: Recording) -> bool:
     """True if an object is a listed change or the leaf of a door, not a mover that stood there.
 
     More than half of its beams are among `changed` (rising), and in the scans in which they are

@@ -5,11 +5,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillmap import em
 from stillmap import io as formats
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.from_arrays import poses_to_matrices
@@ -62,7 +62,7 @@ def read(
 
 def read_poses(
     poses: ArrayLike | str | os.PathLike[str] | None, recording: Recording
-) -> NDArray[np.float64] | None:
+) -> Float | None:
     """Poses to keep, (T, D+1, D+1) T_map_base; None: none.
 
     Args:
@@ -87,9 +87,7 @@ def read_poses(
     return poses_to_matrices("poses", poses, recording.n_scans, recording.dimension, "recording")
 
 
-def require_mappable(
-    recording: Recording, options: Options, poses: NDArray[np.float64] | None
-) -> None:
+def require_mappable(recording: Recording, options: Options, poses: Float | None) -> None:
     """Refuse what cannot be mapped.
 
     Raises:

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
@@ -21,8 +21,6 @@ from stillmap.pipeline.final_map import Maps
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.tracking import FlowMap, MovingObject
 
-Float = NDArray[np.float64]
-Cells = NDArray[np.int64]
 Object = TypeVar("Object", bound=MovingObject)
 
 
@@ -179,13 +177,13 @@ def doors_to_map(
     return [_door_to_map(one, frame, by) for one in doors]
 
 
-def _cells_to_map(frame: LocalFrame, local_map: em.OccupancyMap) -> Cells:
+def _cells_to_map(frame: LocalFrame, local_map: em.OccupancyMap) -> Int64:
     """(2,) cells by which cells of a local frame are others in the map frame."""
     moved = dataclasses.replace(local_map, origin=frame.corner_to_map(local_map.origin))
     return np.asarray(moved.window.first_cell - local_map.window.first_cell)
 
 
-def _door_to_map(door: Door, frame: LocalFrame, by: Cells) -> Door:
+def _door_to_map(door: Door, frame: LocalFrame, by: Int64) -> Door:
     x, y = (np.array(door.hinge) + frame.origin[:2]).tolist()
     return dataclasses.replace(
         door,
@@ -196,5 +194,5 @@ def _door_to_map(door: Door, frame: LocalFrame, by: Cells) -> Door:
     )
 
 
-def _add(cells: Cells, by: Cells) -> Cells:
+def _add(cells: Int64, by: Int64) -> Int64:
     return cells + by[: cells.shape[1]]

@@ -10,10 +10,10 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
@@ -21,8 +21,6 @@ from stillmap.pipeline.em_loop import label_poses
 from stillmap.pipeline.estimate import EmState, Iteration, IterationRecord
 from stillmap.pipeline.options import Options
 from stillmap.slam.odometry_faults import replace_stretches
-
-Float = NDArray[np.float64]
 
 # odometry gets an E-step of its own if its score with the labels so far falls short of the best
 # one by less than this share of it; labels of its own raise it
@@ -34,10 +32,7 @@ _MIN_FAULT_SHARE = 0.05  # of the scans at which odometry is at fault: scans alo
 
 
 def better_source(
-    recording: Recording,
-    state: EmState,
-    progress: Progress,
-    stages: StageTimer,
+    recording: Recording, state: EmState, progress: Progress, stages: StageTimer
 ) -> Iteration | None:
     """The source of poses that predicts held-out scans best, if better than the best iteration.
 
@@ -87,12 +82,8 @@ def _is_better(tried: IterationRecord, best: IterationRecord, source: str) -> bo
 
 
 def _sources(
-    recording: Recording,
-    state: EmState,
-    score: float,
-    progress: Progress,
-    stages: StageTimer,
-) -> Iterator[tuple[str, NDArray[np.float32], slam.MStepResult]]:
+    recording: Recording, state: EmState, score: float, progress: Progress, stages: StageTimer
+) -> Iterator[tuple[str, Float32, slam.MStepResult]]:
     """Names of sources that may be better, the weights of their beams, and their poses."""
     best, options = state.require_best(), state.options
     assert recording.T_odom_base is not None
@@ -107,11 +98,7 @@ def _sources(
         bare, e = recording.without_odometry(), best.p_static
         yield "scans", e, _match_scans(bare, e, best.poses, state, progress, stages)
     mixed = replace_stretches(
-        best.poses,
-        recording.T_odom_base,
-        recording.stamp_ns,
-        diagnostics,
-        options.slam.odometry,
+        best.poses, recording.T_odom_base, recording.stamp_ns, diagnostics, options.slam.odometry
     )
     if mixed is not None:
         number, started = len(state.records) + 1, time.perf_counter()
@@ -132,7 +119,7 @@ def _keep_poses(poses: Float, options: Options) -> slam.MStepResult:
 
 def _match_scans(
     recording: Recording,
-    e: NDArray[np.float32],
+    e: Float32,
     earlier_poses: Float,
     state: EmState,
     progress: Progress,
@@ -160,9 +147,7 @@ def _poses_by_odometry(recording: Recording) -> Float:
     return se2.normalize(se2.inverse(T_odom_base[0]) @ T_odom_base)
 
 
-def _held_out(
-    recording: Recording, poses: Float, e: NDArray[np.float32], options: Options
-) -> float | None:
+def _held_out(recording: Recording, poses: Float, e: Float32, options: Options) -> float | None:
     """Nats per beam of held-out scans at some poses with given labels."""
     threads = resolve_threads(options.threads)
     deskewed = slam.deskew_recording(recording, poses, options.slam, threads)

@@ -8,14 +8,12 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.em import OccupancyMap, final_labels
 from stillmap.mapping.projection import count_small_pieces
 from stillmap.slam import rematching, surface_agreement
-
-Float = NDArray[np.float64]
 
 
 class _Scale(NamedTuple):
@@ -77,11 +75,7 @@ class Quality:
 
 
 def rate_quality(
-    deskewed: Recording,
-    poses: Float,
-    p_static: NDArray[np.float32],
-    occupancy: OccupancyMap,
-    threads: int = 1,
+    deskewed: Recording, poses: Float, p_static: Float32, occupancy: OccupancyMap, threads: int = 1
 ) -> Quality:
     """Rates labels, poses and map of any estimator by the same evidence.
 

@@ -7,10 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stillmap import em, slam
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import limit_blas_threads, resolve_threads, trim_heap, work_beside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
@@ -39,8 +37,6 @@ from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +92,7 @@ class MappingResult(ShortRepr):
         return self.estimate.poses
 
     @property
-    def p_static(self) -> NDArray[np.float32]:
+    def p_static(self) -> Float32:
         """(M,) P(c = 1); NaN: unusable, the prior at maximum range."""
         return self.estimate.p_static
 

@@ -6,6 +6,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.square_box import bound_box
@@ -45,10 +46,7 @@ def extent(occupancy: GridMap) -> Window:
 
 
 def choose_window(
-    whole: Window,
-    resolution: float,
-    points: NDArray[np.float64] | NDArray[np.float32],
-    size_m: float = 12.0,
+    whole: Window, resolution: float, points: Float | Float32, size_m: float = 12.0
 ) -> Window:
     """The square of edge `size_m` that holds most points, within the map's bounds.
 
@@ -74,12 +72,7 @@ def choose_window(
     return left, bottom, right, top
 
 
-def snapshot(
-    number: int,
-    occupancy: GridMap,
-    points: NDArray[np.float64] | NDArray[np.float32],
-    window: Window,
-) -> Snapshot:
+def snapshot(number: int, occupancy: GridMap, points: Float | Float32, window: Window) -> Snapshot:
     """The part of iteration `number`'s map that lies in `window`; points as `choose_window`."""
     p_occupied, origin = cut(occupancy, window)
     inside = np.flatnonzero(_within(points, window))
@@ -94,9 +87,7 @@ def snapshot(
     )
 
 
-def cut(
-    occupancy: GridMap, window: Window
-) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
+def cut(occupancy: GridMap, window: Window) -> tuple[Float32, tuple[float, float, float]]:
     """The cells (h, w) in `window` and their origin; NaN where the window leaves the map."""
     return cut_layer(occupancy, occupancy.p_occupied, window, np.nan)
 
@@ -121,15 +112,13 @@ def cut_layer(
     return cells, origin
 
 
-def _within(points: NDArray[np.float64] | NDArray[np.float32], window: Window) -> NDArray[np.bool_]:
+def _within(points: Float | Float32, window: Window) -> Bool:
     x0, y0, x1, y1 = window
     x, y = points.T
     return np.asarray((x >= x0) & (x < x1) & (y >= y0) & (y < y1))
 
 
-def _densest(
-    points: NDArray[np.float64] | NDArray[np.float32], low: NDArray[np.float64], size: float
-) -> NDArray[np.float64]:
+def _densest(points: Float | Float32, low: Float, size: float) -> Float:
     """(2,) middle of the square of edge `size` with most points, to an eighth of its edge."""
     step = size / 8
     index = np.floor((points - low) / step).astype(np.int64)

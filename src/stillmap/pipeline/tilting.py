@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -26,8 +26,6 @@ from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import HOLD, Box, fit_boxes
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
 from stillmap.tracking.objects_3d import MIN_POINTS
-
-Float = NDArray[np.float64]
 
 _VOXEL = 0.1  # m, edge of the voxels of the occupancy evidence
 _MARGIN = 0.15  # m around the box of an object, where points are probably dynamic
@@ -54,7 +52,7 @@ class TiltingResult(ShortRepr):
     recording: Recording
     deskewed: Recording
     poses: Float
-    p_static: NDArray[np.float32]
+    p_static: Float32
     objects: list[MovingObject]
     unposed_beams: int
     boxes: list[Box]
@@ -75,7 +73,7 @@ class PlanarResult:
 
     deskewed: Recording
     poses: Float
-    p_static: NDArray[np.float32]
+    p_static: Float32
     objects: Sequence[MovingObject]
 
     def static_share(self) -> float:
@@ -129,12 +127,7 @@ def build_tilting(
         share = planar.static_share()
         static = _constant_labels(posed.deskewed, share)
     boxes = fit_boxes(
-        planar.deskewed,
-        planar.poses,
-        planar.p_static,
-        planar.objects,
-        MIN_P_DYNAMIC,
-        HOLD,
+        planar.deskewed, planar.poses, planar.p_static, planar.objects, MIN_P_DYNAMIC, HOLD
     )
     start_ns = int(planar.deskewed.stamp_ns[0])
     in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns, _MARGIN)
@@ -179,7 +172,7 @@ def _occupancy_evidence(
     return occupancy_hmm.e_step(posed.deskewed, poses, _VOXEL, em_options, threads)
 
 
-def _constant_labels(recording: Recording, p_static: float) -> NDArray[np.float32]:
+def _constant_labels(recording: Recording, p_static: float) -> Float32:
     """(M,) the same P(static) for all usable beams."""
     out = recording.allocate_per_beam(np.float32)
     for block in iter_blocks(out, recording.points):
@@ -189,11 +182,8 @@ def _constant_labels(recording: Recording, p_static: float) -> NDArray[np.float3
 
 
 def apply_boxes(
-    static: NDArray[np.float32],
-    in_boxes: Sequence[BoxBeams],
-    share: float,
-    scratch: Path | None = None,
-) -> NDArray[np.float32]:
+    static: Float32, in_boxes: Sequence[BoxBeams], share: float, scratch: Path | None = None
+) -> Float32:
     """P(static) with the boxes: the odds of the box times the odds ratio of the evidence.
 
     Args:
@@ -220,7 +210,7 @@ def _extend_objects(
     in_boxes: Sequence[BoxBeams],
     posed: PosedRecording,
     ground: GroundMap,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
 ) -> list[MovingObject]:
     """The moving objects with points in 3D: with height and beams of the tilting laser."""
     by_id = {one.id: one for one in objects}

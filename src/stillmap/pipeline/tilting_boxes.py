@@ -4,17 +4,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em import GroundMap
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.pipeline.tilting_poses import PosedRecording
 from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _MAX_VEHICLE_HEIGHT = 4.0  # m above the ground
 _MAX_VERTICAL_GAP = 0.5  # m without any point, above which points belong to something else
@@ -30,7 +27,7 @@ class BoxBeams(NamedTuple):
     """
 
     beams: Index
-    core: NDArray[np.bool_]
+    core: Bool
 
 
 def select_box_beams(
@@ -88,7 +85,7 @@ def object_height(height: Float, max_height: float) -> float:
     return float(connected[-1]) if len(connected) else min(_MIN_HEIGHT, max_height)
 
 
-def _end_points(posed: PosedRecording) -> NDArray[np.float32]:
+def _end_points(posed: PosedRecording) -> Float32:
     """(M, 3) end points of hits in the map frame, NaN for others."""
     scans = posed.deskewed
     ends = scans.allocate_per_beam(np.float32, (3,))
@@ -108,7 +105,7 @@ def _beam_time_span(recording: Recording) -> tuple[float, float]:
     return min(low for low, _ in parts), max(high for _, high in parts)
 
 
-def _is_near_path(box: Box, ends: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
+def _is_near_path(box: Box, ends: Float32, margin: float) -> Bool:
     """(n,) whether end points lie near the path of a box at any time; a cheap first test."""
     beyond = box.hold * float(np.linalg.norm(box.velocity[[0, -1]], axis=1).max())
     radius = float(np.linalg.norm(box.half_size)) + 2.0 * margin + beyond

@@ -3,15 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Stamps = NDArray[np.int64]
 
 _BLOCK = 1 << 16  # beams per block
 
@@ -32,7 +28,7 @@ class PosedRecording:
     unposed_beams: int
 
 
-def interpolate_poses(stamp_ns: Stamps, poses: Float, at_ns: Stamps) -> tuple[Float, Bool]:
+def interpolate_poses(stamp_ns: Int64, poses: Float, at_ns: Int64) -> tuple[Float, Bool]:
     """Poses at given times, along the arc from one scan to the next.
 
     Args:
@@ -58,7 +54,7 @@ def interpolate_poses(stamp_ns: Stamps, poses: Float, at_ns: Stamps) -> tuple[Fl
     return poses[before] @ se2.exp(share[:, None] * twist), known
 
 
-def pose_recording(recording: Recording, stamp_ns: Stamps, poses: Float) -> PosedRecording:
+def pose_recording(recording: Recording, stamp_ns: Int64, poses: Float) -> PosedRecording:
     """Deskews a recording by the poses of other scans.
 
     Args:
@@ -96,9 +92,7 @@ def lift_poses(poses: Float) -> Float:
     return out
 
 
-def _transform_points(
-    points: NDArray[np.float32], T_base_sensor: Float, T: Float
-) -> NDArray[np.float32]:
+def _transform_points(points: Float32, T_base_sensor: Float, T: Float) -> Float32:
     """Points (n, 3) of sensors at (n, 4, 4) on a base moved by T (n, 3, 3), in the sensor frame."""
     R, t = T_base_sensor[:, :3, :3], T_base_sensor[:, :3, 3]
     in_base = np.einsum("nij,nj->ni", R, points) + t

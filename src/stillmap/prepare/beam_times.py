@@ -4,12 +4,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.core.source import Spin
-
-Float = NDArray[np.float64]
 
 _SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0}
 _TURN = 2.0 * math.pi
@@ -48,9 +46,7 @@ def add_beam_times(recording: Recording, direction: str) -> Recording:
     return replace(recording, beam_time=beam_time, source=replace(recording.source, spin=spin))
 
 
-def turns_since_stamp(
-    points: NDArray[np.float32], direction: str, stamp_azimuth: float = _SPIN_START
-) -> Float:
+def turns_since_stamp(points: Float32, direction: str, stamp_azimuth: float = _SPIN_START) -> Float:
     """(n,) revolutions between the stamp and each of points (n, 3); 0 for unusable points."""
     sign = _SIGN[direction]
     azimuth = np.arctan2(points[:, 1].astype(np.float64), points[:, 0].astype(np.float64))
@@ -75,7 +71,7 @@ def _with_warning(recording: Recording, what: str) -> Recording:
 
 def assemble_tilting_laser(
     recording: Recording,
-    joint_ns: NDArray[np.int64],
+    joint_ns: Int64,
     joint_angle: Float,
     axis: tuple[float, float, float],
     T_base_joint: Float,

@@ -15,11 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Index, Int64
 from stillmap.core.recording import Recording
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Index = NDArray[np.intp]
 
 # s, from a scan to those that it is compared with: bumps last .3 to 1.5 s, so that some lie outside
 _OFFSETS = (0.4, 0.8, 1.2, 1.8)
@@ -149,7 +146,7 @@ def find_floor_returns(recording: Recording, poses: Float) -> Bool:
     return mask
 
 
-def _reference_scans(seconds: Float, T_map_sensor: Float, side: int) -> NDArray[np.int64]:
+def _reference_scans(seconds: Float, T_map_sensor: Float, side: int) -> Int64:
     """(T, R) scans of one sensor that each is compared with, before (-1) or after (1); -1: none."""
     T = len(seconds)
     number, columns = np.arange(T), []
@@ -175,7 +172,7 @@ def _find_in_chunk(
     recording: Recording,
     scans: Index,
     T_map_sensor: Float,
-    references: NDArray[np.int64],
+    references: Int64,
     own: Index,
     mask: Bool,
 ) -> None:
@@ -201,7 +198,7 @@ def _find_in_chunk(
             mask[beams][floor[: beams.stop - beams.start]] = True
 
 
-def _select_scans(views: ScanViews, own: Index, references: NDArray[np.int64]) -> Index:
+def _select_scans(views: ScanViews, own: Index, references: Int64) -> Index:
     """Those of the scans in which some of every few beams end where others looked past."""
     beams = _coarse_beams(views)
     past = _is_passed(views.compare(own, beams, references)) & views.hit[own][:, beams]
@@ -220,7 +217,7 @@ def _is_passed(relation: NDArray[np.int8]) -> Bool:
     return np.asarray(before.any(axis=1) & after.any(axis=1))
 
 
-def _find_in_scan(views: ScanViews, scan: int, references: NDArray[np.int64]) -> Bool | None:
+def _find_in_scan(views: ScanViews, scan: int, references: Int64) -> Bool | None:
     """(n,) mask of the floor returns of a scan; None: there are none."""
     beams = np.flatnonzero(views.hit[scan])
     relation = views.compare(np.array([scan]), beams, references[None])
@@ -347,9 +344,7 @@ def _came_and_went(relation: NDArray[np.int8], on: Bool) -> bool:
     return bool(np.count_nonzero(votes) >= _MIN_VOTES * len(votes))
 
 
-def _agree_with_one_another(
-    views: ScanViews, before: NDArray[np.int64], after: NDArray[np.int64]
-) -> bool:
+def _agree_with_one_another(views: ScanViews, before: Int64, after: Int64) -> bool:
     """True if one of the scans before agrees with one of those after: odometry did not jump."""
     before, beams = before[before >= 0], _coarse_beams(views)
     relation = views.compare(before, beams, np.tile(after, (len(before), 1)))

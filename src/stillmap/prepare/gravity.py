@@ -8,11 +8,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
-
-Float = NDArray[np.float64]
 
 _MAX_SCANS = 60  # scans used
 _PATCHES = 32  # patches with a normal across an image

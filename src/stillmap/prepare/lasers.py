@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
 from stillmap.core.recording import Recording
 from stillmap.core.source import RangeRule, Source
 from stillmap.prepare import max_range
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-
-Float = NDArray[np.float64]
 
 SAMPLE = 1 << 22  # readings from which the range rule is inferred
 _BLOCK = 1 << 18  # beams at a time: these fit into the CPU caches
@@ -42,9 +41,9 @@ class RawLaser:
     """
 
     name: str
-    stamp_ns: NDArray[np.int64]
-    ranges: NDArray[np.float32]
-    start: NDArray[np.int64]
+    stamp_ns: Int64
+    ranges: Float32
+    start: Int64
     shape: NDArray[np.integer[Any]]
     directions: list[NDArray[np.floating[Any]]]
     beam_steps: tuple[float, ...] = ()
@@ -53,7 +52,7 @@ class RawLaser:
     sample: int = SAMPLE
 
     @cached_property
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> Int64:
         """(T,) number of beams of each scan."""
         return np.asarray(np.array([len(d) for d in self.directions], np.int64)[self.shape])
 
@@ -62,7 +61,7 @@ class RawLaser:
         """The geometry of most scans."""
         return int(np.bincount(self.shape, minlength=len(self.directions)).argmax())
 
-    def sample_readings(self) -> NDArray[np.float32]:
+    def sample_readings(self) -> Float32:
         """(K, n) readings of K scans evenly spread over the recording, padded with NaN."""
         lengths, T = self.lengths, len(self.stamp_ns)
         # a long scan among many short ones makes all rows long: limit the padded size too
@@ -94,11 +93,11 @@ class RawLasers:
     mounts: list[Float]
     T_odom_base: Float | None
     source: Source
-    record: NDArray[np.int64] | None = None
-    to_3d: "Callable[[Beams], tuple[NDArray[np.float32], list[str]]] | None" = None
+    record: Int64 | None = None
+    to_3d: "Callable[[Beams], tuple[Float32, list[str]]] | None" = None
 
 
-def scan_order(lasers: list[RawLaser]) -> NDArray[np.intp]:
+def scan_order(lasers: list[RawLaser]) -> Index:
     """(T,) indices that sort the concatenated scans of all lasers by stamp."""
     return np.argsort(np.concatenate([laser.stamp_ns for laser in lasers]), kind="stable")
 
@@ -170,11 +169,11 @@ class Beams(NamedTuple):
         beam_time: (M,) float32 seconds after the stamp, None without time increments.
     """
 
-    scan: NDArray[np.intp]
-    offset: NDArray[np.int64]
-    points: NDArray[np.float32]
-    hit: NDArray[np.bool_]
-    beam_time: NDArray[np.float32] | None
+    scan: Index
+    offset: Int64
+    points: Float32
+    hit: Bool
+    beam_time: Float32 | None
 
 
 def convert_to_beams(lasers: list[RawLaser], rules: list[RangeRule], scratch: Path | None) -> Beams:
@@ -204,7 +203,7 @@ def convert_to_beams(lasers: list[RawLaser], rules: list[RangeRule], scratch: Pa
 
 
 def _split_into_runs(
-    lasers: list[RawLaser], laser_of: NDArray[np.intp], number: NDArray[np.intp]
+    lasers: list[RawLaser], laser_of: Index, number: Index
 ) -> Iterator[tuple[int, int]]:
     """(first, end) of runs of scans of one laser and geometry with contiguous readings."""
     start, shape, length = np.empty((3, len(laser_of)), np.int64)
@@ -224,9 +223,7 @@ def _split_into_runs(
         yield from ((at, min(at + at_once, end)) for at in range(begin, end, at_once))
 
 
-def _convert_run(
-    laser: RawLaser, rule: RangeRule, run: slice
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _convert_run(laser: RawLaser, rule: RangeRule, run: slice) -> tuple[Float32, Bool]:
     """Points (n, 2) and hits (n,) of a run of scans."""
     directions = laser.directions[laser.shape[run.start]]
     n, start = len(directions), int(laser.start[run.start])

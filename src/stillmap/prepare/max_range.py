@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float32, Index
 from stillmap.core.errors import advise
 from stillmap.core.source import RangeRule
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
@@ -52,7 +52,7 @@ class MaxRange:
     coded: bool
 
 
-def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -> MaxRange:
+def find_max_range(ranges: Float32, declared: float | None = None) -> MaxRange:
     """Find the maximum-range code in the readings of one laser.
 
     A code is a value at the top that repeats (nearly) exactly in many directions. The farthest
@@ -78,7 +78,7 @@ def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -
     return MaxRange(None, "no code among the readings and none declared", False)
 
 
-def _find_code(ranges: NDArray[np.float32], real: NDArray[np.float32]) -> tuple[float, str] | None:
+def _find_code(ranges: Float32, real: Float32) -> tuple[float, str] | None:
     top = _decimal(real.max())
     if _SICK_CODES[0] <= top <= _SICK_CODES[1]:
         codes = real[real >= np.float32(_SICK_CODES[0])]
@@ -106,12 +106,7 @@ def _decimal(value: np.float32) -> float:
     return float(str(np.float32(value)))
 
 
-def _is_code(
-    ranges: NDArray[np.float32],
-    values: NDArray[np.float32],
-    counts: NDArray[np.intp],
-    mode: int,
-) -> bool:
+def _is_code(ranges: Float32, values: Float32, counts: Index, mode: int) -> bool:
     """True if values[mode] is a code (see `find_max_range`).
 
     With noise of 1 cm and readings rounded to cm, the second value has 60 % of the count of the
@@ -129,7 +124,7 @@ def _is_code(
 
 
 def infer_range_rule(
-    ranges: NDArray[np.float32], declared: float | None, options: ReadOptions
+    ranges: Float32, declared: float | None, options: ReadOptions
 ) -> tuple[RangeRule, list[str]]:
     """Infer the rule for the readings (T, n) of one laser, and warnings."""
     limit = find_max_range(ranges, declared)
@@ -169,9 +164,7 @@ def infer_range_rule(
 
 
 def _zero_meaning(
-    ranges: NDArray[np.float32],
-    no_return_share: float,
-    option: Literal["auto", "unusable", "max-range"],
+    ranges: Float32, no_return_share: float, option: Literal["auto", "unusable", "max-range"]
 ) -> tuple[Literal["unusable", "max-range"], str]:
     """Meaning of zero, where a share of the readings has another value for no return."""
     if option != "auto":
@@ -187,7 +180,7 @@ def _zero_meaning(
 
 
 def _free_range(
-    hits: NDArray[np.float32], threshold: float | None, option: float | None
+    hits: Float32, threshold: float | None, option: float | None
 ) -> tuple[float | None, str]:
     """Range up to which a maximum-range beam is free.
 
@@ -204,9 +197,7 @@ def _free_range(
     return seen, f"{100.0 * FREE_QUANTILE:g} % of the hits are nearer"
 
 
-def apply_range_rule(
-    ranges: NDArray[np.float32], rule: RangeRule
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def apply_range_rule(ranges: Float32, rule: RangeRule) -> tuple[Float32, Bool]:
     """Beam lengths (NaN: unusable) and hit mask, in the shape of `ranges`."""
     threshold = np.float32(MAX_PLAUSIBLE_RANGE if rule.threshold is None else rule.threshold)
     zero = (ranges >= 0.0) & (ranges < MAX_ZERO_RANGE)
@@ -220,7 +211,7 @@ def apply_range_rule(
     return length.astype(np.float32, copy=False), hit
 
 
-def find_self_sectors(ranges: NDArray[np.float32], min_range: float) -> tuple[SelfSector, ...]:
+def find_self_sectors(ranges: Float32, min_range: float) -> tuple[SelfSector, ...]:
     """Find the beams of a 2D laser that end on the robot itself; () for a standing robot.
 
     Args:
@@ -254,7 +245,7 @@ def find_self_sectors(ranges: NDArray[np.float32], min_range: float) -> tuple[Se
     )
 
 
-def min_ranges(sectors: Iterable[SelfSector], n: int) -> NDArray[np.float32]:
+def min_ranges(sectors: Iterable[SelfSector], n: int) -> Float32:
     """(n,) range of each beam in metres below which readings are returns from the robot."""
     out = np.zeros(n, np.float32)
     for first, last, limit in sectors:

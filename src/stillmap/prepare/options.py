@@ -132,10 +132,7 @@ class ReadOptions:
     )
     depth_step: int = option(2, "Use every n-th row and column of depth images.", ge=1, le=64)
     depth_scale: float | None = option(
-        None,
-        "Depth image units per metre; unset: 1000, or 5000 for TUM RGB-D.",
-        ge=1e-3,
-        le=1e6,
+        None, "Depth image units per metre; unset: 1000, or 5000 for TUM RGB-D.", ge=1e-3, le=1e6
     )
     topic: str | None = option(
         None, "Scan topics of a bag, separated by commas; unset: chosen by type and rate."

@@ -13,16 +13,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2, se3
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import find_busiest
 from stillmap.prepare.max_range import DECLARED, GIVEN
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, MAX_POINT_DISTANCE
-
-Float = NDArray[np.float64]
 
 # m, and cells, by dimension: a beam is followed up to the greater of both. Planar lasers of robots
 # reach 80 m, lidars 300 m; 2000 cells in all directions take half a gigabyte in 2D
@@ -95,9 +93,7 @@ def leave_out_far_returns(
     return kept, [_sentence(recording, len(returns), len(free), reach)]
 
 
-def shorten_far_beams(
-    points: NDArray[np.float32], hit: NDArray[np.bool_], reach: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def shorten_far_beams(points: Float32, hit: Bool, reach: float) -> tuple[Float32, Bool]:
     """The beams of one scan up to a range: returns beyond it show nothing, other beams end there.
 
     Args:
@@ -113,7 +109,7 @@ def shorten_far_beams(
     return (points * scale[:, None]).astype(np.float32), hit & ~far
 
 
-def _find_far(recording: Recording, reach: float) -> NDArray[np.intp]:
+def _find_far(recording: Recording, reach: float) -> Index:
     """Beams longer than `reach` m."""
     far = [np.zeros(0, np.intp)]
     for block in arrays.iter_blocks(recording.points):
@@ -211,9 +207,7 @@ def leave_out_far_scans(
     return replace(recording, points=points, hit=hit), [sentence]
 
 
-def interpolate_late_odometry(
-    stamp_ns: NDArray[np.int64], T_odom_base: Float
-) -> tuple[Float, NDArray[np.intp]]:
+def interpolate_late_odometry(stamp_ns: Int64, T_odom_base: Float) -> tuple[Float, Index]:
     """Odometry (T, 3, 3) with late readings interpolated, and the scans (K,) that they belong to.
 
     Args:
@@ -233,7 +227,7 @@ def interpolate_late_odometry(
     return out, np.array(sorted(late), np.intp)
 
 
-def _find_late_intervals(seconds: Float, T_odom_base: Float, n: int) -> NDArray[np.intp]:
+def _find_late_intervals(seconds: Float, T_odom_base: Float, n: int) -> Index:
     """First scans of the intervals of n steps within which odometry is late."""
     first = np.arange(1, len(seconds) - n - 1)
     if len(first) == 0:

@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_types import Bool, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import Spin
@@ -90,7 +90,7 @@ def _limit_ranges(recording: Recording, options: ReadOptions) -> Recording:
     return replace(recording, points=points, hit=hit)
 
 
-def _limit_block(points: NDArray[np.float32], hit: NDArray[np.bool_], options: ReadOptions) -> None:
+def _limit_block(points: Float32, hit: Bool, options: ReadOptions) -> None:
     length = np.sqrt(arrays.squared_lengths(points))
     if options.max_range is not None:
         hit &= ~(length >= options.max_range)

@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.core.source import BodyBox
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Index = NDArray[np.intp]
 Planes = tuple[Float, Float]  # ground and ceiling, each (a, b, c) of z = a x + b y + c
 
 _CELL = 0.1  # m
@@ -60,7 +58,7 @@ class SelfMask:
     cells: Bool
     R: Float
 
-    def find_self_returns(self, points: NDArray[np.float32], hit: Bool) -> Index:
+    def find_self_returns(self, points: Float32, hit: Bool) -> Index:
         """Indices of points (n, 3) in the sensor frame that are returns from the robot."""
         near = np.flatnonzero(hit & _is_within(points, 2 * BODY_RADIUS))
         rotated = points[near].astype(np.float64) @ self.R.T
@@ -243,7 +241,7 @@ class ScanSample(NamedTuple):
     """A scan number and a subset of its hits (n, 3), rotated to the axes of the robot."""
 
     scan: int
-    points: NDArray[np.float32]
+    points: Float32
 
 
 def sample_hits(recording: Recording, scan: int, R: Float) -> ScanSample:
@@ -254,7 +252,7 @@ def sample_hits(recording: Recording, scan: int, R: Float) -> ScanSample:
     return ScanSample(scan, (points @ R.T).astype(np.float32))
 
 
-def is_3d_sweep(points: NDArray[np.float32]) -> bool:
+def is_3d_sweep(points: Float32) -> bool:
     """True if the directions of points (n, 3) do not lie in a plane through the sensor."""
     if len(points) < 3:
         return False
@@ -263,7 +261,7 @@ def is_3d_sweep(points: NDArray[np.float32]) -> bool:
     return bool(np.sqrt(max(smallest, 0.0)) > _MIN_PLANE_RMS)
 
 
-def fit_ground_and_ceiling(points: NDArray[np.float32]) -> Planes | None:
+def fit_ground_and_ceiling(points: Float32) -> Planes | None:
     """Fit ground and ceiling to points (n, 3) beyond the robot.
 
     Returns:
@@ -321,7 +319,7 @@ def _is_other_position(before: Float, profile: Float) -> bool:
     return bool(np.mean(change > _MIN_CHANGE[0]) > _MIN_CHANGE[1])
 
 
-def _range_profile(points: NDArray[np.float32], planes: Planes) -> Float:
+def _range_profile(points: Float32, planes: Planes) -> Float:
     """Median range of the obstacles in each direction bin beyond the robot; NaN: none."""
     x, y, z = points.astype(np.float64).T
     range = np.linalg.norm(points, axis=1)

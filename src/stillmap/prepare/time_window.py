@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Int64
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -54,7 +54,7 @@ class TimeWindow:
         self.omitted += not inside
         return inside
 
-    def select_all(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def select_all(self, stamp_ns: Int64) -> Bool:
         """(T,) whether scans with stamps (T,) are to be read; times count from the smallest."""
         if len(stamp_ns) and self._origin_ns is None:
             self._origin_ns = int(stamp_ns.min())

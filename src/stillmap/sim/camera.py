@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32, Int32
 from stillmap.core.camera import Camera, Images, unproject
 from stillmap.core.errors import InputError
-from stillmap.sim.geometry import BOX, ELLIPSOID, Float, Solids, make_pose, to_local
+from stillmap.sim.geometry import BOX, ELLIPSOID, Solids, make_pose, to_local
 from stillmap.sim.options import CameraOptions
 from stillmap.sim.ray_casting import Rays, cast_rays
 from stillmap.sim.truth import ImageTruth
@@ -205,7 +206,7 @@ class TrueImage(NamedTuple):
 
     color: Color
     mask: NDArray[np.uint16]
-    distance: NDArray[np.float32]
+    distance: Float32
 
 
 def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
@@ -306,7 +307,7 @@ class CameraSimulator:
         return TrueImage(self._expose(color, image), mask, range.astype(np.float32))
 
     def _paint(
-        self, range: Float, part: NDArray[np.int32], direction: Float, at: Float, moving: Solids
+        self, range: Float, part: Int32, direction: Float, at: Float, moving: Solids
     ) -> Color:
         """(h, w, 3) colors of the pixels (h, w), given the moving part at each, or -1."""
         assert self._K is not None

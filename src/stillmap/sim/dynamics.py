@@ -5,11 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Int32, Int64
 from stillmap.core.errors import InputError
-from stillmap.sim.laser import Float, Movers, Outlines
+from stillmap.sim.laser import Movers, Outlines
 from stillmap.sim.options import DoorOptions
 from stillmap.sim.people import BODY_RADIUS, Crowd, Figures
 from stillmap.sim.planner import FreeSpace, Planner
@@ -125,7 +125,7 @@ class Doors:
         low, high = (o.min_open, o.max_open) if opens else (o.min_closed, o.max_closed)
         return float(np.exp(self._rng.uniform(np.log(low), np.log(high))))
 
-    def _crossed_by(self, ways: Float) -> NDArray[np.bool_]:
+    def _crossed_by(self, ways: Float) -> Bool:
         """(D,) whether a path segment (K, 4) crosses the doorway."""
         start, end = ways[:, None, :2], ways[:, None, 2:]
         aside = _side_of(self._hinge, self._end, start) * _side_of(self._hinge, self._end, end)
@@ -193,9 +193,9 @@ class Motion:
     outlines: Outlines
     things: Outlines
     still: Float
-    still_thing: NDArray[np.int32]
+    still_thing: Int32
     sizes: Float
-    moved: NDArray[np.bool_]
+    moved: Bool
 
 
 def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
@@ -354,7 +354,7 @@ class Moment:
     Motion is linear between scans, and extrapolated after the last one.
     """
 
-    def __init__(self, motion: Motion, scans: NDArray[np.int64], seconds: Float) -> None:
+    def __init__(self, motion: Motion, scans: Int64, seconds: Float) -> None:
         self._motion = motion
         later = seconds / motion.period
         # no interpolation across the gaps where the robot is carried or pauses

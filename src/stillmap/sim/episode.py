@@ -5,16 +5,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Int32, Int64
 from stillmap.core.source import SensorNotes, Source
 from stillmap.sim.dynamics import Motion, Progress, simulate_motion
 from stillmap.sim.options import OdometryOptions
 from stillmap.sim.scene import Scene
 from stillmap.sim.truth import Truth
-
-Float = NDArray[np.float64]
 
 _FIRST_STAMP_NS = 1_000_000_000 * 10**9
 _SAME_POSE = 1e-12  # m and elements of rotations
@@ -52,14 +50,14 @@ class Episode:
         return bool((self.motion.still_thing >= 0).any())
 
     @property
-    def stamp_ns(self) -> NDArray[np.int64]:
+    def stamp_ns(self) -> Int64:
         """(T,) recorded stamps in ns, rounded."""
         o, exact = self.scene.robot, self.exact_ns
         tick = max(1, round(o.stamp_rounding * 1e9))
         return _FIRST_STAMP_NS + (exact - _FIRST_STAMP_NS + tick // 2) // tick * tick
 
     @property
-    def exact_ns(self) -> NDArray[np.int64]:
+    def exact_ns(self) -> Int64:
         """(T,) exact stamps in ns."""
         return _FIRST_STAMP_NS + np.round(self.motion.seconds * 1e9).astype(np.int64)
 
@@ -70,12 +68,12 @@ class Episode:
 
     def truth(
         self,
-        static: NDArray[np.bool_],
-        mover: NDArray[np.int32],
+        static: Bool,
+        mover: Int32,
         T_world_base: Float,
         more: dict[str, Any] | None = None,
         T_base_sensor: Float | None = None,
-        thing: NDArray[np.int32] | None = None,
+        thing: Int32 | None = None,
     ) -> Truth:
         """The truth about beams; `more` is added to the scene after `mover_kinds`."""
         motion, scene = self.motion, self._describe_scene()
@@ -221,7 +219,7 @@ def remove_jump(T_world_base: Float, scan: int) -> Float:
     return np.concatenate([T_world_base[:scan], back @ T_world_base[scan:]])
 
 
-def _stalls(seconds: Float, o: OdometryOptions, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _stalls(seconds: Float, o: OdometryOptions, rng: np.random.Generator) -> Bool:
     """(T - 1,) whether odometry misses the motion between two scans."""
     often = rng.poisson(o.stall_rate / 60 * (seconds[-1] - seconds[0]))
     stalls = np.zeros(len(seconds) - 1, bool)

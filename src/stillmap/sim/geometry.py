@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stillmap.core.array_types import Bool, Float, Index, Int32, Int64
 from stillmap.sim.options import HeightOptions
-
-Float = NDArray[np.float64]
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 
@@ -25,7 +24,7 @@ class Faces(NamedTuple):
 
     ends: Float
     z: Float
-    is_glass: NDArray[np.bool_]
+    is_glass: Bool
 
     def distance(self, x: float, y: float) -> Float:
         """(F,) metres from a point to each face, in the plane."""
@@ -51,7 +50,7 @@ class Solids(NamedTuple):
     form: NDArray[np.int8]
     half: Float
     z: Float
-    mover: NDArray[np.int32]
+    mover: Int32
 
     @property
     def radius(self) -> Float:
@@ -59,7 +58,7 @@ class Solids(NamedTuple):
         a, b = self.half.T
         return np.asarray(np.where(self.form == BOX, np.hypot(a, b), np.maximum(a, b)))
 
-    def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
+    def select(self, kept: Bool | Index) -> "Solids":
         """A subset of the solids."""
         return Solids._make([self.pose[:, kept], *(values[kept] for values in self[1:])])
 
@@ -93,7 +92,7 @@ class Assembly(NamedTuple):
         solids: the parts, at no time.
     """
 
-    carrier: NDArray[np.int64]
+    carrier: Int64
     offset: Float
     solids: Solids
 
@@ -166,7 +165,7 @@ class Ground(NamedTuple):
         """(...) metres, height of the floor at points (...)."""
         return np.asarray(self.level(x, y) + self.kerb * self.is_paved(x, y))
 
-    def is_paved(self, x: Float, y: Float) -> NDArray[np.bool_]:
+    def is_paved(self, x: Float, y: Float) -> Bool:
         """(...) whether points (...) lie on a pavement."""
         inside = np.zeros(np.shape(x), bool)
         for x0, y0, x1, y1 in self.pavements:
@@ -211,10 +210,10 @@ class MovingSurfaces(NamedTuple):
         solids: the parts, at these times.
     """
 
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Int64
     solids: Solids
 
-    def parts(self, mover: int) -> NDArray[np.intp]:
+    def parts(self, mover: int) -> Index:
         """The numbers of a mover's parts."""
         return np.flatnonzero(self.solids.mover == mover)
 

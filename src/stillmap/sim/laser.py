@@ -8,13 +8,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Int32, Int64
 from stillmap.sim.options import LaserOptions, LidarOptions
 from stillmap.sim.scene import Scene
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _CHUNK = 1000  # scans processed at once
 _SLACK = 1e-9  # beams, so that no ray passes between two walls that share a corner
@@ -35,7 +32,7 @@ class Movers:
     xy: Float
     heading: Float
     semi_axes: Float
-    mover: NDArray[np.int32]
+    mover: Int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +46,7 @@ class Outlines:
     """
 
     faces: Float
-    mover: NDArray[np.int32]
+    mover: Int32
 
 
 class Returns(NamedTuple):
@@ -62,8 +59,8 @@ class Returns(NamedTuple):
     """
 
     range: Float
-    wall: NDArray[np.int32]
-    mover: NDArray[np.int32]
+    wall: Int32
+    mover: Int32
 
 
 def compute_beam_angles(beams: int, fov: float) -> Float:
@@ -121,7 +118,7 @@ class _Scans:
         world = self.theta[:, None] + angles
         self.cos, self.sin = np.cos(world).ravel(), np.sin(world).ravel()
 
-    def covered(self, start: Float, span: Float) -> tuple[Index, Index]:
+    def covered(self, start: Float, span: Float) -> tuple[Int64, Int64]:
         """Pairs (scan, flat beam index) of the beams within world bearings start + [0, span]."""
         turn = 2 * np.pi / self.step
         low = ((start - self.theta - self.first) % (2 * np.pi)) / self.step
@@ -139,7 +136,7 @@ class _Scans:
         return np.concatenate(scans), np.concatenate(beams)
 
 
-def _within(reach: float, scans: _Scans, walls: Float) -> Index:
+def _within(reach: float, scans: _Scans, walls: Float) -> Int64:
     """Indices of walls within `reach` of the box around all sensors."""
     x, y = walls[:, ::2], walls[:, 1::2]
     near = (x.max(axis=1) >= scans.x.min() - reach) & (x.min(axis=1) <= scans.x.max() + reach)
@@ -147,7 +144,7 @@ def _within(reach: float, scans: _Scans, walls: Float) -> Index:
     return np.flatnonzero(near)
 
 
-def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
+def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Int64:
     """Lower flat ranges to a face (4,), or (4, T) if it moves; returns the beams that changed."""
     x0, y0, x1, y1 = face
     bearing = np.arctan2(y0 - scans.y, x0 - scans.x)
@@ -161,16 +158,14 @@ def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
     return _keep_nearer(r, beam, ranges)
 
 
-def _keep_nearer(r: Float, beam: Index, ranges: Float) -> Index:
+def _keep_nearer(r: Float, beam: Int64, ranges: Float) -> Int64:
     """Lower the flat ranges of beams to `r` where it is less; returns the beams that changed."""
     nearer = (r > MIN_RANGE) & (r < ranges[beam])
     ranges[beam[nearer]] = r[nearer]
     return np.asarray(beam[nearer])
 
 
-def _cast_movers(
-    scans: _Scans, movers: Movers, part: slice, ranges: Float, which: NDArray[np.int32]
-) -> None:
+def _cast_movers(scans: _Scans, movers: Movers, part: slice, ranges: Float, which: Int32) -> None:
     for q, (a, b) in enumerate(movers.semi_axes):
         dx = movers.xy[part, q, 0] - scans.x
         dy = movers.xy[part, q, 1] - scans.y
@@ -187,18 +182,15 @@ def _cast_movers(
         which[_keep_nearer(r, beam, ranges)] = movers.mover[q]
 
 
-def find_glass(walls: NDArray[np.int32], scene: Scene) -> NDArray[np.bool_]:
+def find_glass(walls: Int32, scene: Scene) -> Bool:
     """Mask of the wall indices that are glass; indices of glass follow those of opaque walls."""
     first = len(scene.walls)
     return (walls >= first) & (walls < first + len(scene.glass))
 
 
 def simulate_measurement(
-    exact: Float,
-    on_glass: NDArray[np.bool_],
-    o: LidarOptions | LaserOptions,
-    rng: np.random.Generator,
-) -> tuple[Float, NDArray[np.bool_]]:
+    exact: Float, on_glass: Bool, o: LidarOptions | LaserOptions, rng: np.random.Generator
+) -> tuple[Float, Bool]:
     """Measured ranges (T, n) and whether each is a hit (T, n).
 
     Args:

@@ -6,14 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.sim import laser, ray_casting
-from stillmap.sim.geometry import (
-    BOX,
-    Float,
-    Part,
-    assemble,
-    make_pose,
-)
+from stillmap.sim.geometry import BOX, Part, assemble, make_pose
 from stillmap.sim.options import LaserOptions, LidarOptions, RigOptions
 from stillmap.sim.ray_casting import RayReturns, Rays
 from stillmap.sim.scene import Scene

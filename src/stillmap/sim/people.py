@@ -3,11 +3,11 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.errors import InputError
 from stillmap.sim.options import CrowdOptions, Shape
-from stillmap.sim.planner import Float, FreeSpace, Planner
+from stillmap.sim.planner import FreeSpace, Planner
 
 BODY_RADIUS = 0.26  # m, minimum distance from walls
 
@@ -194,7 +194,7 @@ class Crowd:
             self._set_off(person)
 
 
-def _goals_in_part(planner: Planner, places: NDArray[np.int64], part: int) -> NDArray[np.int64]:
+def _goals_in_part(planner: Planner, places: Int64, part: int) -> Int64:
     """The goals in a part of free space; all its nodes where it has none."""
     inside = places[planner.part_of(places) == part]
     every = planner.nodes

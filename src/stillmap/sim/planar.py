@@ -4,15 +4,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int32
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
 from stillmap.sim import laser
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
-from stillmap.sim.laser import Float, Movers, Returns
+from stillmap.sim.laser import Movers, Returns
 from stillmap.sim.options import LaserOptions, RobotOptions
 from stillmap.sim.truth import Truth
 
@@ -74,9 +74,7 @@ def record_planar(episode: Episode) -> tuple[Recording, Truth]:
     return recording, truth
 
 
-def _find_standing_things(
-    exact: Returns, hit: NDArray[np.bool_], episode: Episode
-) -> NDArray[np.int32] | None:
+def _find_standing_things(exact: Returns, hit: Bool, episode: Episode) -> Int32 | None:
     """(M,) index of the movable object, standing still, that each beam (T, n) hit; -1: none."""
     if not episode.has_standing_things:
         return None
@@ -129,7 +127,7 @@ class Sweep:
         share = middle * (angles[1] - angles[0]) / options.fov
         return cls(group, options.sweep_time * share)
 
-    def beam_times(self, beams: int) -> NDArray[np.float32]:
+    def beam_times(self, beams: int) -> Float32:
         """(n,) seconds after the stamp, of each beam of a scan."""
         return np.repeat(self.seconds, self.group)[:beams].astype(np.float32)
 
@@ -170,7 +168,7 @@ def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOpti
 
 
 def _reflect_beams(
-    exact: Returns, by: NDArray[np.bool_], episode: Episode, T_base_sensor: Float, bearing: Float
+    exact: Returns, by: Bool, episode: Episode, T_base_sensor: Float, bearing: Float
 ) -> Returns:
     """Returns whose beams go on, from the mirror that they meet, to what it shows.
 
@@ -288,9 +286,7 @@ def add_floor(exact: Returns, bearing: Float, tilt: Float, height: float) -> Ret
     )
 
 
-def find_blind_scans(
-    seconds: Float, options: LaserOptions, rng: np.random.Generator
-) -> NDArray[np.bool_]:
+def find_blind_scans(seconds: Float, options: LaserOptions, rng: np.random.Generator) -> Bool:
     """(T,) mask of the scans without any return.
 
     Args:

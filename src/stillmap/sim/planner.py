@@ -8,9 +8,8 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Int32, Int64
 from stillmap.core.errors import InputError
-
-Float = NDArray[np.float64]
 
 _SPACING = 0.1  # m between nodes of the clearance grid
 _STRIDE = 2  # the planner uses every second node
@@ -110,7 +109,7 @@ class Planner:
         self.parts = len(labels)
         self._least = clearance
         self.nodes = np.flatnonzero(self._part >= 0)
-        self._trees: dict[int, NDArray[np.int32]] = {}
+        self._trees: dict[int, Int32] = {}
 
     # built on demand: slow in a large world
 
@@ -133,11 +132,11 @@ class Planner:
             raise InputError(what, hint=hint)
         return part
 
-    def part_of(self, node: int | NDArray[np.int64]) -> NDArray[np.int64]:
+    def part_of(self, node: int | Int64) -> Int64:
         """Part of the nodes, numbered as the points `inside`."""
         return np.asarray(self._part[node])
 
-    def point(self, node: NDArray[np.int64]) -> Float:
+    def point(self, node: Int64) -> Float:
         """(..., 2) points in metres of the nodes (...)."""
         grid = np.stack([node % self._shape[1], node // self._shape[1]], axis=-1)
         return np.asarray(self._space.origin + grid * (_SPACING * _STRIDE))
@@ -170,7 +169,7 @@ class Planner:
             chain.append(int(tree[chain[-1]]))
         return self._shorten(start, self.point(self.nodes[chain]))
 
-    def is_visible(self, start: Float, ends: Float) -> NDArray[np.bool_]:
+    def is_visible(self, start: Float, ends: Float) -> Bool:
         """(K,) whether straight lines from a point (2,) to points (K, 2) keep the clearance."""
         delta = ends - start
         steps = int(np.ceil(np.abs(delta).max(initial=0.0) / _SPACING)) + 1
@@ -191,7 +190,7 @@ class Planner:
         return np.array(corners or [points[-1]])
 
 
-def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> "scipy.sparse.csr_array":
+def _graph(part: Bool, clearance: Float, least: float) -> "scipy.sparse.csr_array":
     """8-neighbour graph of the nodes of `part`; edges along walls cost more.
 
     Nodes are numbered in the order of `part`, without those outside.

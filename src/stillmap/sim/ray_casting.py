@@ -9,9 +9,9 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids, StaticSurfaces
+from stillmap.core.array_types import Bool, Float, Int32
+from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids, StaticSurfaces
 from stillmap.sim.laser import MIN_RANGE
 
 Window = tuple[slice, slice]  # columns, channels
@@ -57,9 +57,9 @@ class RayReturns(NamedTuple):
     """
 
     range: Float
-    part: NDArray[np.int32]
-    mover: NDArray[np.int32]
-    on_glass: NDArray[np.bool_]
+    part: Int32
+    mover: Int32
+    on_glass: Bool
 
 
 def cast_rays(rays: Rays, static: StaticSurfaces, moving: Solids) -> RayReturns:

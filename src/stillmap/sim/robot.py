@@ -1,10 +1,10 @@
 """A robot that follows its route (pure pursuit) and waits for people in its way."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Int64
 from stillmap.sim.options import RobotOptions
-from stillmap.sim.planner import Float, FreeSpace, Planner
+from stillmap.sim.planner import FreeSpace, Planner
 from stillmap.sim.scene import Light, Point
 from stillmap.sim.vehicles import SpeedProfile
 
@@ -98,7 +98,7 @@ class Robot:
         self.pose = np.array([*self._way[self._at], heading])
         self._speed, self._waited = 0.0, 0.0
 
-    def _places_to_put_down(self, rng: np.random.Generator) -> NDArray[np.int64]:
+    def _places_to_put_down(self, rng: np.random.Generator) -> Int64:
         """Points of the route where the robot may be put down, in the order of preference."""
         by = self._options.carried_by
         if by is not None:
@@ -119,7 +119,7 @@ class Robot:
         """(K, 2) the next `reach` metres of its route."""
         return np.asarray(self._way[self._ahead(round(reach / _SPACING))])
 
-    def _ahead(self, count: int) -> NDArray[np.int64]:
+    def _ahead(self, count: int) -> Int64:
         ahead = np.arange(self._at, self._at + count + 1)
         last = len(self._way) - 1
         return ahead % len(self._way) if self._closed else np.minimum(ahead, last)

@@ -7,10 +7,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are first used
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float
 from stillmap.sim.dynamics import place_faces
-from stillmap.sim.planner import Float, FreeSpace, compute_segment_distance
+from stillmap.sim.planner import FreeSpace, compute_segment_distance
 from stillmap.sim.scene import Door, Scene, Segment, Stay, Thing
 from stillmap.sim.walls import box
 from stillmap.sim.world_3d import trace_chains
@@ -158,15 +158,13 @@ class Floor:
             return False
         return not meets_box(solid, place, np.array(size) / 2 + _MIN_GAP)
 
-    def _leaves_ways(
-        self, place: Place, size: Size, space: FreeSpace, ways: NDArray[np.bool_]
-    ) -> bool:
+    def _leaves_ways(self, place: Place, size: Size, space: FreeSpace, ways: Bool) -> bool:
         """True if the robot still gets everywhere but to the room of the box itself."""
         after = self._main_part(space.with_walls(np.array(box(place.x, place.y, *size, place.yaw))))
         far = np.hypot(*(_points(space, ways & ~after) - place[:2]).T)
         return bool(np.all(far < math.hypot(*size) / 2 + _AROUND))
 
-    def _main_part(self, space: FreeSpace) -> NDArray[np.bool_]:
+    def _main_part(self, space: FreeSpace) -> Bool:
         """(H, W) nodes of the largest part of free space through which the robot gets."""
         parts, count = scipy.ndimage.label(space.clearance >= _WAY, structure=np.ones((3, 3)))
         anchors = np.round((self._anchors - space.origin) / space.spacing).astype(int)
@@ -177,7 +175,7 @@ class Floor:
         return np.asarray(parts == sizes.argmax())
 
 
-def _points(space: FreeSpace, nodes: NDArray[np.bool_]) -> Float:
+def _points(space: FreeSpace, nodes: Bool) -> Float:
     """(K, 2) metres, of the nodes of a mask (H, W)."""
     rows, columns = np.nonzero(nodes)
     return np.asarray(space.origin + np.column_stack([columns, rows]) * space.spacing)

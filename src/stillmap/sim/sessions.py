@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.json import write_json
 from stillmap.sim.dynamics import faces_at_all_places
 from stillmap.sim.options import HeightOptions
-from stillmap.sim.planner import Float, FreeSpace, Planner
+from stillmap.sim.planner import FreeSpace, Planner
 from stillmap.sim.scene import Point, Scene
 from stillmap.sim.session_layout import Layout, StandingObject
 from stillmap.sim.simulator import Simulation, count_beams, simulate, write_folder

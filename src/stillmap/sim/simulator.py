@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import ArrayBuilder, write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
@@ -21,7 +22,7 @@ from stillmap.sim.camera import CameraSimulator, Color
 from stillmap.sim.dynamics import Progress
 from stillmap.sim.episode import simulate_episode
 from stillmap.sim.geometry import make_pose
-from stillmap.sim.laser import Float, simulate_measurement
+from stillmap.sim.laser import simulate_measurement
 from stillmap.sim.lidar import Sensor
 from stillmap.sim.planar import record_planar
 from stillmap.sim.scene import Scene

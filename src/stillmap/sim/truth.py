@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import open_npy, read_npz, write_arrays
+from stillmap.core.array_types import Bool, Float, Float32, Int32, Int64
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json, write_json
 from stillmap.io.images import read_image, write_png
 from stillmap.io.trajectory import write_tum
-from stillmap.sim.geometry import Faces, Float, Ground, MovingSurfaces, Solids, StaticSurfaces
+from stillmap.sim.geometry import Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
 
 FOLDER = "truth"
 SCENE = "scene.json"
@@ -48,15 +49,15 @@ class Truth:
             throughout; -1: none. None where there is no such object.
     """
 
-    static: NDArray[np.bool_]
-    mover: NDArray[np.int32]
-    T_world_base: NDArray[np.float64]
-    walls: NDArray[np.float64]
-    movers: NDArray[np.float64]
+    static: Bool
+    mover: Int32
+    T_world_base: Float
+    walls: Float
+    movers: Float
     scene: dict[str, Any]
-    lasting: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
-    T_base_sensor: NDArray[np.float64] | None = None
-    thing: NDArray[np.int32] | None = None
+    lasting: Float = field(default_factory=lambda: np.empty((0, 4)))
+    T_base_sensor: Float | None = None
+    thing: Int32 | None = None
 
 
 def load_truth(path: str | Path) -> Truth:
@@ -92,7 +93,7 @@ class ImageTruth:
     moving: MovingSurfaces
     T_world_camera: Float
     mask: Callable[[int], NDArray[np.uint16]]
-    distance: Callable[[int], NDArray[np.float32]]
+    distance: Callable[[int], Float32]
 
 
 def load_image_truth(path: str | Path) -> ImageTruth:
@@ -118,7 +119,7 @@ def load_image_truth(path: str | Path) -> ImageTruth:
     def mask(image: int) -> NDArray[np.uint16]:
         return read_image(_image_files(folder, image)[0])
 
-    def distance(image: int) -> NDArray[np.float32]:
+    def distance(image: int) -> Float32:
         metres = read_image(_image_files(folder, image)[1]).astype(np.float32) / 1e3
         return np.where(metres > 0.0, metres, np.float32(np.inf))
 
@@ -145,7 +146,7 @@ def _image_files(folder: Path, image: int) -> tuple[Path, Path]:
     return folder / IMAGES / f"{image:06d}.png", folder / IMAGES / f"{image:06d}-distance.png"
 
 
-def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
+def write_truth(truth: Truth, stamp_ns: Int64, folder: Path) -> None:
     """Write the truth about the beams of a recording into its folder."""
     inside = folder / FOLDER
     inside.mkdir()
@@ -175,9 +176,7 @@ def write_image_truth(surfaces: ImageTruth, folder: Path) -> None:
     write_npy(folder / CAMERAS, surfaces.T_world_camera)
 
 
-def write_seen(
-    folder: Path, image: int, mask: NDArray[np.uint16], distance: NDArray[np.float32]
-) -> None:
+def write_seen(folder: Path, image: int, mask: NDArray[np.uint16], distance: Float32) -> None:
     """Write mask and distances of an image into a truth folder."""
     paths = _image_files(folder, image)
     write_png(mask, paths[0])

@@ -3,12 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Int64
 from stillmap.sim.options import RobotOptions, TrafficOptions
 from stillmap.sim.scene import Lane, Light
-
-Float = NDArray[np.float64]
 
 _SPACING = 0.25  # m between points of a lane
 
@@ -136,7 +134,7 @@ class Traffic:
                 gaps[on] = np.minimum(gaps[on], between - self.size[on, 0] / 2 - radius)
         return gaps
 
-    def _to_red_light(self, track: "_Track", on: NDArray[np.int64]) -> Float:
+    def _to_red_light(self, track: "_Track", on: Int64) -> Float:
         """(N,) metres from vehicles `on` a lane to the next red light that they can stop at."""
         gaps = np.full(len(on), np.inf)
         for light, line in zip(track.lane.lights, track.lines, strict=True):

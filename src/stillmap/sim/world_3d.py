@@ -5,15 +5,14 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Int64
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
 from stillmap.sim.geometry import (
     BOX,
     Faces,
-    Float,
     Ground,
     MovingSurfaces,
     Part,
@@ -226,7 +225,7 @@ class World(NamedTuple):
         robot = _shake(episode.motion.robot, ground, scene.lidar, rng)
         return cls(episode, make_static_world(scene, ground), movers, robot)
 
-    def moment(self, scans: NDArray[np.int64], seconds: Float) -> Moment:
+    def moment(self, scans: Int64, seconds: Float) -> Moment:
         """N times: `seconds` after the stamps of scans."""
         return Moment(self.episode.motion, scans, seconds)
 
