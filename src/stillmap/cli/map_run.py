@@ -205,11 +205,13 @@ def _map_tilting_laser(
     result: MappingResult, tilting: Recording, options: Options
 ) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
-    from stillmap.pipeline.tilting import PlanarResult, build_tilting, shift_tilting
+    from stillmap.pipeline.map_frame import Shift, shift
+    from stillmap.pipeline.tilting import PlanarResult, build_tilting
 
     near, threads = result.near, resolve_threads(options.threads)
     planar = PlanarResult(near.deskewed, near.poses, near.p_static, near.objects)
-    return shift_tilting(build_tilting(planar, tilting, options.em, threads), result.frame.origin)
+    built = build_tilting(planar, tilting, options.em, threads)
+    return shift(built, Shift(result.frame.origin))
 
 
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")

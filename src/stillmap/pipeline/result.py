@@ -20,17 +20,7 @@ from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
-from stillmap.pipeline.map_frame import (
-    changes_to_map,
-    doors_to_map,
-    enter_local_frame,
-    estimate_to_map,
-    maps_to_map,
-    objects_to_map,
-    restore_odometry,
-    snapshots_to_map,
-    traffic_to_map,
-)
+from stillmap.pipeline.map_frame import Shift, enter_local_frame, move_odometry, shift
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
@@ -196,7 +186,7 @@ def map_recording(
             _run_em(recording, state, None, progress, stages, checkpoint)
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
-    recording = restore_odometry(recording, odometry)
+    recording = move_odometry(recording, odometry.origin)
     result = dataclasses.replace(
         result, recording=recording, calibration=calibration, warnings=warnings
     )
@@ -299,15 +289,7 @@ def _to_map_frame(result: MappingResult, frame: LocalFrame) -> MappingResult:
     """A result that was computed in a frame near the robot, in the map frame."""
     if not frame.is_shifted:
         return result
-    return dataclasses.replace(
-        result,
-        snapshots=snapshots_to_map(result.snapshots, frame),
-        estimate=estimate_to_map(result.estimate, frame, result.options.slam.resolution),
-        maps=maps_to_map(result.maps, frame),
-        objects=objects_to_map(result.objects, frame),
-        traffic=traffic_to_map(result.traffic, frame),
-        changes=changes_to_map(result.changes, frame, result.map),
-        doors=doors_to_map(result.doors, frame, result.map),
-        frame=frame,
-        local=result,
-    )
+    by = Shift.of(frame, result.map)
+    parts = ("snapshots", "estimate", "maps", "objects", "traffic", "changes", "doors")
+    moved = {name: shift(getattr(result, name), by) for name in parts}
+    return dataclasses.replace(result, **moved, frame=frame, local=result)

@@ -145,20 +145,6 @@ def build_tilting(
     )
 
 
-def shift_tilting(result: TiltingResult, by: Float) -> TiltingResult:
-    """The same in a frame whose origin lies at minus (3,) metres; itself where that is zero."""
-    if not by.any():
-        return result
-    poses = result.poses.copy()
-    poses[:, :3, 3] += by
-    objects = [
-        dataclasses.replace(one, xy=one.xy + by[:2], z=None if one.z is None else one.z + by[2])
-        for one in result.objects
-    ]
-    boxes = [dataclasses.replace(one, xy=one.xy + by[:2]) for one in result.boxes]
-    return dataclasses.replace(result, poses=poses, objects=objects, boxes=boxes)
-
-
 def _occupancy_evidence(
     posed: PosedRecording, ground: GroundMap, em_options: EmOptions, threads: int
 ) -> EStepResult:

@@ -21,8 +21,9 @@ from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.views import View
+from stillmap.pipeline.map_frame import Shift, shift
 from stillmap.pipeline.result import MappingResult
-from stillmap.pipeline.tilting import TiltingResult, shift_tilting
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.gltf import write_glb
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def build_models(
         seen = mapped.near
         boxes = box_objects(seen.objects, start_ns)
     else:  # the flat laser gives the tracks, the tilting laser the 3D data
-        seen = shift_tilting(tilting, -origin)
+        seen = shift(tilting, Shift(-origin))
         ground = estimate_ground(seen.deskewed, seen.poses, seen.p_static, threads)
         boxes = extrude_boxes(seen.boxes, seen.objects, ground)
     objects, region = seen.objects, result.options.output.region
