@@ -194,7 +194,7 @@ def _load_checkpoint(
             say("an earlier run was interrupted: starts anew; --resume would continue it")
         checkpoints.clear()
         return None
-    state = checkpoints.load(run_id, given.options, given.recording, stages)
+    state = checkpoints.load(run_id, given.options, stages)
     if state is not None and not args.quiet:
         say(f"continues after iteration {len(state.records)}")
     return state

@@ -6,6 +6,7 @@ options, and a hash of its input. The folder is locked while the run lasts.
 
 import dataclasses
 import hashlib
+import json
 import math
 import os
 import shutil
@@ -54,15 +55,12 @@ class CheckpointFolder:
         complete = [one for one in folders if one.name.removeprefix("iteration-").isdecimal()]
         return max(complete, key=lambda one: int(one.name.removeprefix("iteration-")), default=None)
 
-    def load(
-        self, key: dict[str, Any], options: Options, recording: Recording, stages: StageTimer
-    ) -> EmState | None:
+    def load(self, key: dict[str, Any], options: Options, stages: StageTimer) -> EmState | None:
         """The state of the run at its last checkpoint; None: there is none.
 
         Args:
             key: of the run, see `identify_run`.
             options: of the run, resolved.
-            recording: T scans with M beams.
             stages: the time that the run took so far is added here.
 
         Raises:
@@ -75,15 +73,20 @@ class CheckpointFolder:
         record = read_record(path)
         try:
             _require_same_run(record["key"], key, str(self.folder))
-            state = _unpack_state(record["state"], options, folder, record["digests"])
-            _require_fit(state, recording)
+            arrays = {
+                name: open_npy(folder / f"{Path(name).name}.npy") for name in record["arrays"]
+            }
+            if record["digest"] != _digest(record["state"], *arrays.values()):
+                raise ValueError("not what was written")
+            values = {**_unpack(record["state"], arrays), "options": options}
+            adapter = TypeAdapter(list[EmState], config=ConfigDict(arbitrary_types_allowed=True))
+            [state] = adapter.validate_python([values])
             stages.add(record["stages"])
         except InputError:
             raise
         except Exception as error:  # what no run has written fails in many ways
-            raise InputError(
-                f"is damaged: {error!r}".replace("\n", " "), where=str(path)
-            ) from error
+            what = f"is damaged: {error!r}".replace("\n", " ")
+            raise InputError(what, where=str(path)) from error
         self.is_in_use = True
         return state
 
@@ -97,8 +100,8 @@ class CheckpointFolder:
         work, final = self.folder / "new.part", self.folder / f"iteration-{len(state.records)}"
         arrays: dict[str, NDArray[Any]] = {}
         values = _pack({**vars(state), "options": None}, "state", arrays)
-        digests = {name: _digest(array) for name, array in arrays.items()}
-        record = {"key": key, "state": values, "digests": digests, "stages": stages.to_dict()}
+        record = {"key": key, "state": values, "arrays": [*arrays], "stages": stages.to_dict()}
+        record["digest"] = _digest(values, *arrays.values())
         try:
             remove(work)
             work.mkdir()
@@ -169,69 +172,34 @@ def _pack(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
     return str(value) if is_special else value
 
 
-def _unpack_state(values: Any, options: Options, folder: Path, digests: dict[str, str]) -> EmState:
-    """The state that `_pack` was given.
-
-    Raises:
-        InputError: an array is not that which was written.
-        Exception: what else is not.
-    """
-
-    def unpack(value: Any) -> Any:
-        if isinstance(value, list):
-            return [unpack(item) for item in value]
-        if not isinstance(value, dict):
-            return value
-        if _FILE in value:
-            return _read_array(folder, value[_FILE], digests)
-        if _ARRAY in value:
-            dtype, shape, content = value[_ARRAY]
-            return np.array(content, np.dtype(dtype)).reshape(shape)
-        if _GRID in value:
-            return em.make_grid(*value[_GRID])
-        return {key: unpack(item) for key, item in value.items()}
-
-    adapter = TypeAdapter(list[EmState], config=ConfigDict(arbitrary_types_allowed=True))
-    [state] = adapter.validate_python([{**unpack(values), "options": options}])
-    return state
-
-
-def _read_array(folder: Path, name: str, digests: dict[str, str]) -> NDArray[Any]:
-    path = folder / f"{Path(name).name}.npy"
-    array = open_npy(path)
-    if _digest(array) != digests[name]:
-        raise InputError("is damaged: not the array that was written", where=str(path))
-    return array
-
-
-def _require_fit(state: EmState, recording: Recording) -> None:
-    """Refuse a state of something else than this recording, though their keys are equal.
-
-    Raises:
-        ValueError: it is.
-    """
-    shape = (recording.n_scans, recording.dimension + 1, recording.dimension + 1)
-    for estimate in (state.require_best(), state.latest):
-        n_labels = 0 if estimate is None else len(estimate.p_static)
-        if estimate is None or estimate.poses.shape != shape or n_labels != recording.n_beams:
-            raise ValueError("poses or labels of another recording")
+def _unpack(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    """The values that `_pack` was given, as far as JSON has them."""
+    if isinstance(value, list):
+        return [_unpack(item, arrays) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if _FILE in value:
+        return arrays[value[_FILE]]
+    if _ARRAY in value:
+        dtype, shape, content = value[_ARRAY]
+        return np.array(content, np.dtype(dtype)).reshape(shape)
+    if _GRID in value:
+        return em.make_grid(*value[_GRID])
+    return {key: _unpack(item, arrays) for key, item in value.items()}
 
 
 def identify_run(recording: Recording, options: Options, poses: Float | None) -> dict[str, Any]:
     """The key of a run: its version, options, and a hash of the arrays of its input."""
     names = ("stamp_ns", "offset", "points", "hit", "beam_time", "T_base_sensor", "sensor")
     arrays = (*(getattr(recording, name) for name in names), recording.T_odom_base, poses)
-    options_now = {
-        one.name: to_jsonable(one.value)
-        for one in iter_options(options)
-        if one.name not in _NO_MATTER
-    }
-    return {"version": package_version(), **options_now, "input": _digest(*arrays)}
+    values = {one.name: to_jsonable(one.value) for one in iter_options(options)}
+    matter = {name: value for name, value in values.items() if name not in _NO_MATTER}
+    return {"version": package_version(), **matter, "input": _digest(None, *arrays)}
 
 
-def _digest(*arrays: NDArray[Any] | None) -> str:
-    """Of the types, shapes and values of arrays."""
-    digest = hashlib.blake2b(digest_size=16)
+def _digest(values: Any, *arrays: NDArray[Any] | None) -> str:
+    """Of JSON values and of the types, shapes and values of arrays."""
+    digest = hashlib.blake2b(json.dumps(values).encode(), digest_size=16)
     for array in arrays:
         digest.update(b"none" if array is None else f"{array.dtype.str} {array.shape}".encode())
         for part in () if array is None else iter_bytes(array):
@@ -246,13 +214,9 @@ def _require_same_run(before: dict[str, Any], now: dict[str, Any], where: str) -
         InputError: it names what differs.
     """
     names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
-    if not names:
-        return
-    differ = [
-        "another recording, odometry or poses"
-        if name == "input"
-        else f"{name} was {before.get(name)!r}, is {now.get(name)!r}"
-        for name in names
-    ]
-    hint = "give the same as before, or start anew without resume=True"
-    raise InputError(f"cannot be resumed: {'; '.join(differ)}", where=where, hint=hint)
+    differ = [f"{name} was {before.get(name)!r}, is {now.get(name)!r}" for name in names]
+    if "input" in names:
+        differ[names.index("input")] = "another recording, odometry or poses"
+    if differ:
+        hint = "give the same as before, or start anew without resume=True"
+        raise InputError(f"cannot be resumed: {'; '.join(differ)}", where=where, hint=hint)
