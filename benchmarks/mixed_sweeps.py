@@ -14,7 +14,7 @@ import stillmap
 from stillmap import slam
 from stillmap.core import se2, se3
 from stillmap.core.profiling import StageTimer, no_progress
-from stillmap.pipeline.final_map import make_maps
+from stillmap.pipeline.final_map import FinalEstimate, make_maps
 from stillmap.results.eval.labels import score_labels
 from stillmap.results.eval.map import GHOST_DISTANCE, is_near_occupied
 from stillmap.results.eval.trajectory import align, compute_absolute_errors
@@ -136,7 +136,8 @@ def _map_of_truth(result: stillmap.Result, simulation: Simulation) -> stillmap.e
     e_step = dataclasses.replace(estimate.e_step, p_static=labels, occupied=None, ground=None)
     true = dataclasses.replace(estimate, m_step=m_step, e_step=e_step)
     deskewed = slam.deskew_recording(simulation.recording, truth.T_world_base, options.slam)
-    return make_maps(deskewed, true, options, no_progress, StageTimer()).filtered
+    final = FinalEstimate(deskewed, true, [], [])
+    return make_maps(final, options, no_progress, StageTimer()).filtered
 
 
 def _ghosts_per_100_m2(grid: Grid, walls: Float, T_world_map: Float) -> float:

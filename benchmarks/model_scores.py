@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.json import to_jsonable
-from stillmap.pipeline.tilting_poses import lift_poses
+from stillmap.pipeline.tilting_beams import lift_poses
 from stillmap.results.eval import trajectory
 from stillmap.results.eval.trajectory import read_paired_poses
 from stillmap.results.reader import require_there

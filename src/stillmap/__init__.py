@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from stillmap.live.scan import Scan
     from stillmap.live.update import Update
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.em_loop import iterate
-    from stillmap.pipeline.estimate import Iteration
+    from stillmap.pipeline.em_loop import Iteration, iterate
     from stillmap.pipeline.inputs import read
     from stillmap.pipeline.options import Options
     from stillmap.places.merge import merge
@@ -54,7 +53,7 @@ __all__ = [
 # loaded when they are first used: `stillmap --help` has no use for them, and they take long
 _MODULES = {
     "InputError": "core.errors",
-    "Iteration": "pipeline.estimate",
+    "Iteration": "pipeline.em_loop",
     "LiveMapper": "live.mapper",
     "MissingExtra": "core.errors",
     "Models": "mesh.build",

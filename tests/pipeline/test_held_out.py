@@ -9,6 +9,7 @@ import stillmap
 from stillmap import em
 from stillmap.core.config import override
 from stillmap.pipeline import result as results
+from stillmap.pipeline.final_map import FinalEstimate
 from stillmap.pipeline.options import Options
 
 WITHOUT_LAST = {"change_detection": False}
@@ -17,7 +18,7 @@ WITHOUT_LAST = {"change_detection": False}
 @pytest.fixture(autouse=True)
 def without_final_e_step(monkeypatch):
     """The score is of the loop's labels: the final E-step comes after it."""
-    monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, [], []))
+    monkeypatch.setattr(results, "final_estimate", lambda *given: FinalEstimate(*given[:2], [], []))
 
 
 def options(estimator, **changes):

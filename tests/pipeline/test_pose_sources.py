@@ -11,7 +11,7 @@ from stillmap import slam
 from stillmap.core import se2
 from stillmap.core.profiling import StageTimer, no_progress
 from stillmap.pipeline import pose_sources
-from stillmap.pipeline.estimate import EmState
+from stillmap.pipeline.em_loop import EmState
 from stillmap.pipeline.options import DEFAULTS, resolve_options
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.results.writer import save

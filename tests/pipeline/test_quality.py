@@ -151,9 +151,8 @@ def test_of_one_scan_nothing_can_be_told(run):
     quality = rate_quality(recording, np.eye(3)[None], p_static, occupancy)
     assert quality.geometry is None
     assert quality.overall is None
-    assert (
-        describe_quality(quality).geometry == "geometry: cannot be determined from this recording"
-    )
+    words = describe_quality(quality)
+    assert words["geometry"] == "geometry: cannot be determined from this recording"
 
 
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio"])
@@ -170,5 +169,5 @@ def test_run_json_has_it_and_it_is_read_again(room, tmp_path, estimator):
 
 def test_no_result_is_good_whose_labels_are_poor():
     good, poor = (describe_quality(Quality(82.0, labels, 96.0)) for labels in (75.0, 49.0))
-    assert good.overall == "overall 82 of 100: good"
-    assert poor.overall == "overall 82 of 100: usable; see which part is lower"
+    assert good["overall"] == "overall 82 of 100: good"
+    assert poor["overall"] == "overall 82 of 100: usable; see which part is lower"

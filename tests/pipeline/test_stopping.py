@@ -10,7 +10,8 @@ from stillmap import _core, em, slam
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.pipeline import result as results
-from stillmap.pipeline.estimate import Estimate, Iteration, IterationRecord
+from stillmap.pipeline.em_loop import Estimate, Iteration, IterationRecord
+from stillmap.pipeline.final_map import FinalEstimate
 from stillmap.pipeline.options import Options
 
 
@@ -45,7 +46,9 @@ def build(monkeypatch, short):
                 yield made_up(recording, number, bound * recording.n_beams, share, **more)
 
         monkeypatch.setattr(results, "iterate", fake)
-        monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, [], []))
+        monkeypatch.setattr(
+            results, "final_estimate", lambda *given: FinalEstimate(*given[:2], [], [])
+        )
         return stillmap.build(recording, chosen), len(asked)
 
     return run

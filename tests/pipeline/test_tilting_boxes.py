@@ -8,7 +8,7 @@ from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.pipeline import tilting
 from stillmap.pipeline.tilting import PlanarResult, apply_boxes, build_tilting
-from stillmap.pipeline.tilting_boxes import BoxBeams, object_height
+from stillmap.pipeline.tilting_beams import BoxBeams, object_height
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_boxes
 

@@ -6,7 +6,7 @@ import pytest
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.pipeline import tilting_poses
-from stillmap.pipeline.tilting_poses import interpolate_poses, pose_recording
+from stillmap.pipeline.tilting_beams import interpolate_poses, pose_recording
 
 TWIST = np.array([0.8, 0.1, 0.6])  # m/s, m/s, rad/s
 START = se2.matrix(1.0, -2.0, 2.5)

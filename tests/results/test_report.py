@@ -135,7 +135,7 @@ def test_quality_in_figures_and_words(result, section):
     text = re.sub(r"\s+", " ", text)
     words = describe_quality(rated.quality)
     for name, figure in (("Overall", 71), ("Labels", 91), ("Geometry", 56)):
-        line = getattr(words, name.lower()).partition(": ")[2]
+        line = words[name.lower()].partition(": ")[2]
         assert f"{name} {figure} of 100 {line}." in text
     text = " ".join(Page(section(render_report(result), "Quality")).text)
     assert text.count("cannot be determined from this recording.") == 3

@@ -21,7 +21,7 @@ from stillmap.io.registry import detect_format
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline import inputs
 from stillmap.pipeline.checkpoint import CheckpointFolder, identify_run
-from stillmap.pipeline.estimate import EmState
+from stillmap.pipeline.em_loop import EmState
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.prepare.options import ReadOptions

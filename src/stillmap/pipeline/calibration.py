@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -36,27 +36,17 @@ from stillmap.slam.mount_calibration import (
 from stillmap.slam.spin_estimation import estimate_spin
 
 
-class CorrectedRecording(NamedTuple):
-    """A recording as it is mapped.
-
-    Attributes:
-        recording: without impossible readings, with beam times, mounts and odometry as found.
-        options: with what was found in place of `auto`.
-        calibration: of mounts and odometry; empty with given poses.
-        notes: a sentence for everything that was changed.
-    """
-
-    recording: Recording
-    options: Options
-    calibration: Calibration
-    notes: list[str]
-
-
 def correct_recording(
     recording: Recording, options: Options, poses: Float | None
-) -> CorrectedRecording:
-    """Leave out what cannot be, time sweeps, and calibrate; poses (T, D+1, D+1): those to keep."""
-    cell = options.slam.resolution
+) -> tuple[Recording, Options, Calibration, list[str]]:
+    """Leave out what cannot be, time sweeps, and calibrate; poses (T, D+1, D+1): those to keep.
+
+    Returns:
+        the recording without impossible readings, with beam times, mounts and odometry as found;
+        options with what was found in place of `auto`; the calibration, empty with given poses; a
+        sentence for everything that was changed.
+    """
+    cell, calibration = options.slam.resolution, Calibration()
     recording, notes = remove_leaps(recording)
     if poses is not None:
         recording, more = leave_out_far_scans(recording, poses, cell)
@@ -66,11 +56,10 @@ def correct_recording(
     notes += more
     recording, options, more = time_sweeps(recording, options)
     notes += more
-    calibration = Calibration()
     if poses is None:
         recording, calibration, more = calibrate_recording(recording, options)
         notes += more
-    return CorrectedRecording(recording, options, calibration, notes)
+    return recording, options, calibration, notes
 
 
 def calibrate_recording(
@@ -104,7 +93,7 @@ def calibrate_recording(
     for k, laser in enumerate(found.lasers):
         which = "the laser" if len(found.lasers) == 1 else f"laser {k + 1}"
         sentences += _laser_sentences(which, laser, found.upside_down[k])
-    return applied, found, sentences + _odometry_sentences(found.odometry)
+    return applied, found, [*sentences, *_odometry_sentences(found.odometry)]
 
 
 def time_sweeps(recording: Recording, options: Options) -> tuple[Recording, Options, list[str]]:
@@ -202,52 +191,41 @@ def _correct_odometry(recording: Recording, found: Calibration) -> Recording:
     return dataclasses.replace(recording, T_odom_base=odometry)
 
 
-def _laser_sentences(which: str, laser: dict[str, Parameter], upside_down: bool) -> list[str]:
-    out = []
+def _laser_sentences(which: str, laser: dict[str, Parameter], upside_down: bool) -> Iterator[str]:
     if upside_down:
-        out.append(f"{which} hangs upside down, as its motion shows: its scans are mirrored")
+        yield f"{which} hangs upside down, as its motion shows: its scans are mirrored"
     yaw = laser.get(YAW)
     if yaw is not None and yaw.significant:
         value, std, nominal = (math.degrees(v) for v in (yaw.value, yaw.std, yaw.nominal))
-        out.append(
+        yield (
             f"{which} is turned by {value:.1f} +- {std:.1f} degrees on the robot, as its motion "
             f"shows, not by {nominal:.1f} as recorded: used"
         )
-    place = [laser[name] for name in POSITION if name in laser]
-    if any(one.significant for one in place):
-        here, recorded = (
-            " and ".join(
-                f"{getattr(laser[name], what):.2f} m {side}"
-                for name, side in zip(POSITION, ("ahead", "left"), strict=True)
-                if name in laser
-            )
-            for what in ("value", "nominal")
+    place = {name: laser[name] for name in POSITION if name in laser}
+    if any(one.significant for one in place.values()):
+        sides = dict(zip(POSITION, ("ahead", "left"), strict=True))
+        here = " and ".join(f"{one.value:.2f} m {sides[name]}" for name, one in place.items())
+        there = " and ".join(f"{one.nominal:.2f} m {sides[name]}" for name, one in place.items())
+        std = max(one.std for one in place.values())
+        yield (
+            f"{which} is {here} of the robot's centre (+- {std:.3f} m), as its motion shows, not "
+            f"{there} as recorded: used"
         )
-        out.append(
-            f"{which} is {here} of the robot's centre (+- {max(one.std for one in place):.3f} m), "
-            f"as its motion shows, not {recorded} as recorded: used"
-        )
-    return out
 
 
-def _odometry_sentences(odometry: dict[str, Parameter]) -> list[str]:
-    out: list[str] = []
-    if not odometry:
-        return out
+def _odometry_sentences(odometry: dict[str, Parameter]) -> Iterator[str]:
+    significant = {name: one for name, one in odometry.items() if one.significant}
     for name, what in ((SCALE, "distance"), (GAIN, "rotation")):
-        one = odometry[name]
-        if one.significant:
+        if one := significant.get(name):
             percent, std = 100.0 * (one.value - 1.0), 100.0 * one.std
             more = "more" if percent > 0 else "less"
-            out.append(
+            yield (
                 f"odometry counts {abs(percent):.1f} +- {std:.1f} % {more} {what} than the scans "
                 "show: corrected"
             )
-    latency = odometry.get(LATENCY)
-    if latency is not None and latency.significant:
+    if latency := significant.get(LATENCY):
         when = "late" if latency.value > 0 else "early"
-        out.append(
+        yield (
             f"odometry is {abs(latency.value):.2f} +- {latency.std:.2f} s {when} against the "
             "scans: corrected"
         )
-    return out

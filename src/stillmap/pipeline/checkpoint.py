@@ -32,7 +32,7 @@ from stillmap.core.interrupts import defer_signals
 from stillmap.core.json import to_jsonable
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
-from stillmap.pipeline.estimate import EmState
+from stillmap.pipeline.em_loop import EmState
 from stillmap.pipeline.options import Options
 
 _RECORD, _LOCK = "checkpoint.json", "lock"

@@ -1,14 +1,13 @@
 """Warnings of a run: what limits the trust in its result, where, and what to do about it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from stillmap.core.array_types import Float
 from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
-from stillmap.core.source import Source
-from stillmap.pipeline.estimate import Estimate, IterationRecord
+from stillmap.pipeline.em_loop import Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps
 from stillmap.pipeline.snapshots import extent
 
@@ -25,28 +24,14 @@ def find_warnings(
         recording: the input.
         records: of all iterations.
     """
-    explained = best.m_step.explained  # NaN: poses were given
-    out = _reader_warnings(recording.source)
-    given = len(explained) > 0 and bool(np.isnan(explained).all())
-    if recording.T_odom_base is None and not given:
-        out.append(
-            "no odometry: the robot was assumed to keep its velocity from one scan to the next"
-        )
-    out += _source_warnings(records, best.number)
-    out += _odometry_warnings(best)
-    out += _length_warnings(best)
-    out += _place_warnings(best)
-    lost = np.flatnonzero(explained < _LOST)
-    if len(lost):
-        out.append(
-            advise(
-                f"{_count_scans(len(lost))} fit{'s' * (len(lost) == 1)} the map badly (less than a "
-                f"fifth of the beams), first at {_place(best, lost[0])}",
-                "look for bent or doubled walls there; if there are any, record that part again, "
-                "slower or with odometry",
-            )
-        )
-    return out
+    return [
+        *recording.source.warnings,
+        *_input_warnings(best, recording),
+        *_source_warnings(records, best.number),
+        *_odometry_warnings(best),
+        *_length_warnings(best),
+        *_place_warnings(best),
+    ]
 
 
 def find_map_warnings(maps: Maps, recording: Recording, poses: Float) -> list[str]:
@@ -80,96 +65,96 @@ def find_map_warnings(maps: Maps, recording: Recording, poses: Float) -> list[st
     ]
 
 
-def _reader_warnings(source: Source) -> list[str]:
-    out = list(source.warnings)
-    if skipped := source.n_skipped:
-        out.append(
-            f"{_count_scans(skipped)} {'were' if skipped > 1 else 'was'} left out while reading "
-            "(`stillmap info` says why)"
-        )
-    return out
+def _input_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
+    """What was left out, and that there is no odometry."""
+    if skipped := recording.source.n_skipped:
+        were = "were" if skipped > 1 else "was"
+        why = "left out while reading (`stillmap info` says why)"
+        yield f"{_count_scans(skipped)} {were} {why}"
+    explained = best.m_step.explained  # NaN: poses were given
+    if recording.T_odom_base is None and not (len(explained) and np.isnan(explained).all()):
+        yield "no odometry: the robot was assumed to keep its velocity from one scan to the next"
 
 
-def _source_warnings(records: Sequence[IterationRecord], best: int) -> list[str]:
+_SOURCES = {
+    "odometry": "odometry alone",
+    "scans": "scan matching without odometry",
+    "odometry_in_stretches": "odometry in stretches that scan matching measured otherwise",
+}
+
+
+def _source_warnings(records: Sequence[IterationRecord], best: int) -> Iterator[str]:
     """That odometry or scans alone explain the recording better than iterations did."""
-    out = []
-    name = {
-        "odometry": "odometry alone",
-        "scans": "scan matching without odometry",
-        "odometry_in_stretches": "odometry in stretches that scan matching measured otherwise",
-    }
     for record in records:
         if record.source:
             kept = "were kept" if record.number == best else "were the start of further iterations"
-            out.append(
-                f"poses by {name[record.source]} predict scans left out of the map better than "
+            yield (
+                f"poses by {_SOURCES[record.source]} predict scans left out of the map better than "
                 f"those of iterations 1 to {record.number - 1}: they {kept}"
             )
-    return out
 
 
-def _odometry_warnings(best: Estimate) -> list[str]:
+def _odometry_warnings(best: Estimate) -> Iterator[str]:
     """Scans that contradict odometry: their poses follow the scans, so nothing has to be done."""
-    out, found = [], best.m_step.diagnostics
+    found = best.m_step.diagnostics
     if faults := found.odometry_faults:
-        out.append(
+        yield (
             f"odometry and scans disagree at {_count_scans(len(faults))} (wheel slip or stall, "
             f"odometry that starts again), first at {_place(best, faults[0])}: poses follow the "
             "scans there"
         )
     if widened := found.widened:
-        out.append(
+        yield (
             f"{_count_scans(len(widened))} lay outside the uncertainty of odometry and "
             f"{'were' if len(widened) > 1 else 'was'} found by a wider search, first at "
             f"{_place(best, widened[0])}"
         )
-    return out
 
 
-def _length_warnings(best: Estimate) -> list[str]:
+def _length_warnings(best: Estimate) -> Iterator[str]:
     """That scans do not show how far the robot went."""
     bare = best.m_step.diagnostics.bare_stretches
-    if not bare:
-        return []
-    worst = max(bare, key=lambda stretch: stretch.std)
-    others = f" ({len(bare) - 1} more in doubts.length_unknown of run.json)" * (len(bare) > 1)
-    return [
-        advise(
+    if bare:
+        worst = max(bare, key=lambda stretch: stretch.std)
+        others = f" ({len(bare) - 1} more in doubts.length_unknown of run.json)" * (len(bare) > 1)
+        yield advise(
             f"from {_place(best, worst.first)} to {_place(best, worst.last)} the scans hardly show "
             f"how far the robot went (bare walls, or few returns): the {worst.metres:.1f} m "
             f"between are uncertain by about {worst.std:.1f} m{others}",
             "measure that length in the map; if it is wrong, record with wheel odometry or a "
             "longer range, or drive back to a place seen before",
         )
-    ]
 
 
-def _place_warnings(best: Estimate) -> list[str]:
-    """That the robot was carried elsewhere, or may be at another place."""
-    out, found = [], best.m_step.diagnostics
-    out += [
-        advise(
+def _place_warnings(best: Estimate) -> Iterator[str]:
+    """That the robot was carried elsewhere, may be at another place, or fits the map badly."""
+    found = best.m_step.diagnostics
+    for scan in found.ambiguous:
+        yield advise(
             f"from {_place(best, scan)} on, another place fits about as well as the one that "
             "odometry leads to: odometry's was kept",
             "look whether walls are doubled there; if so, record again with more of the way "
             "between the two places",
         )
-        for scan in found.ambiguous
-    ]
     for scan in found.breaks:
         what = f"before {_place(best, scan)} the robot was carried elsewhere"
-        if scan in found.unconnected:
-            out.append(
-                advise(
-                    f"{what}: no place after it is known from before, so that this part of the map "
-                    "lies at an arbitrary pose",
-                    "record again so that the robot ends where it was before, or map the part "
-                    "before and the part after on their own",
-                )
-            )
-        else:
-            out.append(f"{what}: it was relocalized among the places known from before")
-    return out
+        if scan not in found.unconnected:
+            yield f"{what}: it was relocalized among the places known from before"
+            continue
+        yield advise(
+            f"{what}: no place after it is known from before, so that this part of the map lies at "
+            "an arbitrary pose",
+            "record again so that the robot ends where it was before, or map the part before and "
+            "the part after on their own",
+        )
+    lost = np.flatnonzero(best.m_step.explained < _LOST)
+    if len(lost):
+        yield advise(
+            f"{_count_scans(len(lost))} fit{'s' * (len(lost) == 1)} the map badly (less than a "
+            f"fifth of the beams), first at {_place(best, lost[0])}",
+            "look for bent or doubled walls there; if there are any, record that part again, "
+            "slower or with odometry",
+        )
 
 
 def _place(best: Estimate, scan: int) -> str:

@@ -2,12 +2,13 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 import stillmap._core as _core
 from stillmap import em, slam
-from stillmap.core.array_types import Float, Index, Int64
+from stillmap.core.array_types import Float, Index
 from stillmap.core.parallel import resolve_threads, trim_heap
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
@@ -30,7 +31,7 @@ from stillmap.mapping import (
 from stillmap.mapping.lone_leaves import find_leaf_lines
 from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
-from stillmap.pipeline.estimate import Estimate
+from stillmap.pipeline.em_loop import Estimate
 from stillmap.pipeline.options import Options
 from stillmap.tracking import MovingObject, track_objects
 from stillmap.tracking.motion_evidence import apply_motion_evidence
@@ -59,24 +60,33 @@ class Maps(ShortRepr):
     beyond: Float = field(default_factory=lambda: np.zeros((0, 2)))
 
 
-def final_estimate(
-    recording: Recording, best: Estimate, options: Options
-) -> tuple[Recording, Estimate, list[Change], list[Door]]:
-    """The last E-step: labels of the map as it is shown, the places that changed, and the doors.
+class FinalEstimate(NamedTuple):
+    """The estimate with the labels of the map as it is shown.
 
-    Returns:
-        the recording without motion during its scans, the estimate with these labels, changes,
-        doors, of which those that were seen to swing are among the changes, too.
+    Attributes:
+        deskewed: the recording without motion during its scans.
+        estimate: with these labels.
+        changes: places that changed.
+        doors: of which those that were seen to swing are among the changes, too.
     """
+
+    deskewed: Recording
+    estimate: Estimate
+    changes: list[Change]
+    doors: list[Door]
+
+
+def final_estimate(recording: Recording, best: Estimate, options: Options) -> FinalEstimate:
+    """The last E-step."""
     threads = resolve_threads(options.threads)
     deskewed = slam.deskew_recording(recording, best.poses, options.slam, threads)
     cell, look = options.slam.resolution, options.em.time_bin
     changed = best.e_step.changed_cells
     if changed is not None:  # 3D: every E-step knows of them
         changes = detect_changes_3d(changed, deskewed, best.poses, cell, look)
-        return deskewed, best, changes, []
+        return FinalEstimate(deskewed, best, changes, [])
     if recording.dimension == 3 or options.estimator != "stillmap":
-        return deskewed, best, [], []
+        return FinalEstimate(deskewed, best, [], [])
     deskewed, reflected = remove_reflections(deskewed, best.poses, best.p_static, cell)
     found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)
     if reflected is not None:  # unusable beams have no label
@@ -85,29 +95,18 @@ def final_estimate(
         )
     best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
-        return deskewed, best, [], []
+        return FinalEstimate(deskewed, best, [], [])
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
     changes = detect_changes(courses, deskewed, cell, look, movers)
     surface = courses.cells[courses.p_in_map("majority") > 0.5]
-    changes = join_doors(changes, _find_doors(deskewed, best, courses, surface, cell, look))
+    lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
+    every = detect_changes(courses, deskewed, cell, look)  # of dynamic hits, too
+    found_doors = find_doors(every, lines, surface, deskewed, best.poses, cell)
+    changes = join_doors(changes, found_doors)
     swung = [one.door for one in changes if one.door is not None]
     lone = find_lone_doors(surface, swung, deskewed, best.poses, cell, threads)
     best = _relabel(deskewed, best, courses, changes, lone, options, threads)
-    return deskewed, best, changes, [*swung, *lone]
-
-
-def _find_doors(
-    deskewed: Recording,
-    best: Estimate,
-    courses: em.CellHistories,
-    surface: Int64,
-    cell: float,
-    look: float,
-) -> list[Change]:
-    """Doors, from what changed and from dynamic hits, beside what is there most of the time."""
-    changes = detect_changes(courses, deskewed, cell, look)
-    lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
-    return find_doors(changes, lines, surface, deskewed, best.poses, cell)
+    return FinalEstimate(deskewed, best, changes, [*swung, *lone])
 
 
 def _relabel(
@@ -145,14 +144,10 @@ def _add_motion_evidence(
 
 
 def make_maps(
-    deskewed: Recording,
-    estimate: Estimate,
-    options: Options,
-    progress: Progress,
-    stages: StageTimer,
+    final: FinalEstimate, options: Options, progress: Progress, stages: StageTimer
 ) -> Maps:
     """The maps of an estimate; of 3D recordings, of the obstacles projected to the plane."""
-    threads = resolve_threads(options.threads)
+    deskewed, estimate, threads = final.deskewed, final.estimate, resolve_threads(options.threads)
     progress("making the map", 0, 0, 0)
     with stages.measure("maps"):
         planar, ground = deskewed, None
@@ -228,23 +223,16 @@ def _wanted_places(planar: Recording, estimate: Estimate, options: Options) -> F
     return np.asarray(planar.T_map_sensor(estimate.poses)[:, :2, 2])
 
 
-def find_objects(
-    deskewed: Recording,
-    estimate: Estimate,
-    maps: Maps,
-    changes: list[Change],
-    doors: list[Door],
-    options: Options,
-) -> list[MovingObject]:
+def find_objects(final: FinalEstimate, maps: Maps, options: Options) -> list[MovingObject]:
     """Moving objects; in 2D without those whose beams ended on a door or what is a change."""
+    deskewed, estimate, changes, doors = final
     poses, p_static = estimate.poses, estimate.p_static
     if maps.ground is not None:
         threads = resolve_threads(options.threads)
         return track_objects_3d(deskewed, poses, p_static, maps.ground, options.objects, threads)
     objects = track_objects(deskewed, poses, p_static, options.objects)
-    changed = find_changed_object_beams(
-        deskewed, poses, p_static, changes, doors, maps.filtered.resolution
-    )
+    cell = maps.filtered.resolution
+    changed = find_changed_object_beams(deskewed, poses, p_static, changes, doors, cell)
     moved = [one for one in objects if not _is_change(one, changed, deskewed)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 

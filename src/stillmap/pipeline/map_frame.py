@@ -15,7 +15,7 @@ from stillmap.core.recording import Recording
 from stillmap.em.types import CellProbabilities, ChangedCells, NoReturnModel
 from stillmap.io.point_cloud.origin import cloud_origin
 from stillmap.mapping import Change, Door
-from stillmap.pipeline.estimate import Estimate
+from stillmap.pipeline.em_loop import Estimate
 from stillmap.pipeline.final_map import Maps
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.pipeline.tilting import TiltingResult

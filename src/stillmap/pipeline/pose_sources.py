@@ -17,8 +17,7 @@ from stillmap.core.array_types import Float, Float32
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
-from stillmap.pipeline.em_loop import label_poses
-from stillmap.pipeline.estimate import EmState, Iteration, IterationRecord
+from stillmap.pipeline.em_loop import EmState, Iteration, IterationRecord, label_poses
 from stillmap.pipeline.options import Options
 from stillmap.slam.odometry_faults import replace_stretches
 

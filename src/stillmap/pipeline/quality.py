@@ -161,58 +161,46 @@ def _round(value: float | None) -> float | None:
     return None if value is None else round(value, 1)
 
 
-@dataclass(frozen=True)
-class QualityText:
-    """One line in plain English for each part of a `Quality`."""
-
-    overall: str
-    labels: str
-    geometry: str
-
-
-def describe_quality(quality: Quality) -> QualityText:
-    """One line for each part, for readers who do not know how it is computed."""
-    geometry = _line("geometry", quality.geometry, _GEOMETRY)
-    if quality.labels is None or quality.geometry is None:
-        labels = _line("labels", quality.labels, _LABELS)
-        overall = _line("overall", quality.overall, _GEOMETRY)
-        if quality.geometry is not None:
-            labels = "labels: cannot be determined, as hardly anything moves"
-        return QualityText(overall, labels, geometry)
-    most = min(quality.labels, quality.geometry) + _MAX_CONTRAST
-    overall = _line("overall", quality.overall, _OVERALL, most)
-    return QualityText(overall, _line("labels", quality.labels, _LABELS), geometry)
-
-
 # the sentence on overall is at most that of the lower part plus this: no good map with poor labels
 _MAX_CONTRAST = 25.0
 
-# lowest figure of each sentence, best first
-_OVERALL = (
-    (80.0, "good"),
-    (60.0, "usable; see which part is lower"),
-    (40.0, "look at the map before it is used, first where the lower part points to"),
-    (0.0, "doubtful; see which part is low, the other one may be good"),
-)
-_LABELS = (
-    (80.0, "a second estimate agrees about nearly all that moved"),
-    (60.0, "a second estimate agrees about most of what moved"),
-    (40.0, "a second estimate disagrees about much of what moved"),
-    (0.0, "a second estimate confirms little of what moved; usual where little moves"),
-)
-_GEOMETRY = (
-    (80.0, "scans matched anew and surfaces observed again agree with the map"),
-    (60.0, "scans matched anew or surfaces observed again are off by centimetres in places"),
-    (40.0, "scans or surfaces are off in places, or the map has many small pieces"),
-    (0.0, "the map may be bent or double: scans or walls observed again lie elsewhere"),
-)
+_LOWEST = (80.0, 60.0, 40.0, 0.0)  # figure of each sentence
+_SENTENCES = {
+    "overall": (
+        "good",
+        "usable; see which part is lower",
+        "look at the map before it is used, first where the lower part points to",
+        "doubtful; see which part is low, the other one may be good",
+    ),
+    "labels": (
+        "a second estimate agrees about nearly all that moved",
+        "a second estimate agrees about most of what moved",
+        "a second estimate disagrees about much of what moved",
+        "a second estimate confirms little of what moved; usual where little moves",
+    ),
+    "geometry": (
+        "scans matched anew and surfaces observed again agree with the map",
+        "scans matched anew or surfaces observed again are off by centimetres in places",
+        "scans or surfaces are off in places, or the map has many small pieces",
+        "the map may be bent or double: scans or walls observed again lie elsewhere",
+    ),
+}
 
 
-def _line(
-    name: str, value: float | None, sentences: tuple[tuple[float, str], ...], most: float = 100.0
-) -> str:
-    """The sentence of a value, or of `most` where the value is larger."""
-    if value is None:
-        return f"{name}: cannot be determined from this recording"
-    sentence = next(text for lowest, text in sentences if min(value, most) >= lowest)
-    return f"{name} {value:.0f} of 100: {sentence}"
+def describe_quality(quality: Quality) -> dict[str, str]:
+    """One line for each part, for readers who do not know how it is computed."""
+    out = {}
+    for part, sentences in _SENTENCES.items():
+        value = judged = getattr(quality, part)
+        if value is None:
+            is_still = part == "labels" and quality.geometry is not None
+            why = ", as hardly anything moves" if is_still else " from this recording"
+            out[part] = f"{part}: cannot be determined{why}"
+            continue
+        if part == "overall" and quality.labels is not None and quality.geometry is not None:
+            judged = min(value, min(quality.labels, quality.geometry) + _MAX_CONTRAST)
+        elif part == "overall":
+            sentences = _SENTENCES["geometry"]
+        which = next(k for k, lowest in enumerate(_LOWEST) if judged >= lowest)
+        out[part] = f"{part} {value:.0f} of 100: {sentences[which]}"
+    return out

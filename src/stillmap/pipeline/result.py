@@ -17,9 +17,8 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping import Change, Door
 from stillmap.pipeline.calibration import correct_recording
 from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
-from stillmap.pipeline.em_loop import iterate
-from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
-from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
+from stillmap.pipeline.em_loop import EmState, Estimate, IterationRecord, iterate
+from stillmap.pipeline.final_map import FinalEstimate, Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.map_frame import Shift, enter_local_frame, move_odometry, shift
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
@@ -225,16 +224,14 @@ def _finish(
     options = state.options
     progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):
-        deskewed, estimate, changes, doors = final_estimate(
-            recording, state.require_best(), options
-        )
+        final = final_estimate(recording, state.require_best(), options)
     trim_heap()
-    maps = make_maps(deskewed, estimate, options, progress, stages)
+    estimate = final.estimate
+    maps = make_maps(final, options, progress, stages)
     trim_heap()
-    objects, quality = _track_and_rate(
-        deskewed, estimate, maps, changes, doors, options, progress, stages
-    )
-    del deskewed
+    objects, quality = _track_and_rate(final, maps, options, progress, stages)
+    changes, doors = final.changes, final.doors
+    del final
     trim_heap()
     return MappingResult(
         recording=recording,
@@ -258,14 +255,7 @@ def _finish(
 
 
 def _track_and_rate(
-    deskewed: Recording,
-    estimate: Estimate,
-    maps: Maps,
-    changes: list[Change],
-    doors: list[Door],
-    options: Options,
-    progress: Progress,
-    stages: StageTimer,
+    final: FinalEstimate, maps: Maps, options: Options, progress: Progress, stages: StageTimer
 ) -> tuple[list[MovingObject], Quality]:
     """Moving objects, and the quality of the result.
 
@@ -274,12 +264,12 @@ def _track_and_rate(
     """
     progress("tracking objects", 0, 0, 0)
     threads = resolve_threads(options.threads)
-    rate = partial(
-        rate_quality, deskewed, estimate.poses, estimate.p_static, maps.filtered, threads
-    )
+    deskewed, estimate = final.deskewed, final.estimate
+    labels = (estimate.poses, estimate.p_static, maps.filtered)
+    rate = partial(rate_quality, deskewed, *labels, threads)
     with work_beside(rate, threads if deskewed.dimension == 3 else 1) as rated:
         with stages.measure("objects"):
-            objects = find_objects(deskewed, estimate, maps, changes, doors, options)
+            objects = find_objects(final, maps, options)
         progress("rating the map", 0, 0, 0)
         with stages.measure("quality"):
             return objects, rated()

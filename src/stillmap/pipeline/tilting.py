@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,12 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
-from stillmap.pipeline.tilting_boxes import BoxBeams, select_box_beams
-from stillmap.pipeline.tilting_poses import PosedRecording, pose_recording
+from stillmap.pipeline.tilting_beams import (
+    BoxBeams,
+    PosedRecording,
+    pose_recording,
+    select_box_beams,
+)
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import HOLD, Box, fit_boxes
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
@@ -76,12 +80,6 @@ class PlanarResult:
     p_static: Float32
     objects: Sequence[MovingObject]
 
-    def static_share(self) -> float:
-        """Share of its hits that is static."""
-        p, hit = self.p_static, self.deskewed.hit
-        sums = [float(p[b][hit[b]].sum(dtype=float)) for b in iter_blocks(p)]
-        return sum(sums) / max(sum(int(hit[b].sum()) for b in iter_blocks(hit)), 1)
-
 
 def check_rig(planar: Recording, tilting: Recording, where: str) -> None:
     """Checks that two recordings can be of one rig.
@@ -118,20 +116,17 @@ def build_tilting(
     posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
     # from all level surfaces, as nothing is labelled yet
     ground = estimate_ground(posed.deskewed, posed.poses, _constant_labels(posed.deskewed, 1.0))
-    learned: dict[str, Any] = {}
+    learned: dict[str, Any] = {"p_static": em_options.prior}
+    static = _constant_labels(posed.deskewed, em_options.prior)
     if use_evidence:
         evidence = _occupancy_evidence(posed, ground, em_options, threads)
         static, learned = evidence.p_static, evidence.learned
-        share = cast(float, learned["p_static"])
-    else:
-        share = planar.static_share()
-        static = _constant_labels(posed.deskewed, share)
     boxes = fit_boxes(
         planar.deskewed, planar.poses, planar.p_static, planar.objects, MIN_P_DYNAMIC, HOLD
     )
     start_ns = int(planar.deskewed.stamp_ns[0])
     in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns, _MARGIN)
-    p_static = apply_boxes(static, in_boxes, share, recording.scratch)
+    p_static = apply_boxes(static, in_boxes, learned["p_static"], recording.scratch)
     return TiltingResult(
         recording,
         posed.deskewed,

@@ -15,7 +15,7 @@ from stillmap.core.json import to_jsonable
 from stillmap.core.tiles import Layer, tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
-from stillmap.pipeline.estimate import IterationRecord
+from stillmap.pipeline.em_loop import IterationRecord
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.objects import MILLIMETRES

@@ -150,9 +150,9 @@ def _quality_data(result: MappingResult) -> list[tuple[str, float | None, str]]:
     """Each part of the quality: its name, from 0 to 100 (None: unknown), and words."""
     quality, words = result.quality, describe_quality(result.quality)
     return [
-        ("Overall", quality.overall, _sentence_of(words.overall)),
-        ("Labels", quality.labels, _sentence_of(words.labels)),
-        ("Geometry", quality.geometry, _sentence_of(words.geometry)),
+        ("Overall", quality.overall, _sentence_of(words["overall"])),
+        ("Labels", quality.labels, _sentence_of(words["labels"])),
+        ("Geometry", quality.geometry, _sentence_of(words["geometry"])),
     ]
 
 
