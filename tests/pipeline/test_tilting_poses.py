@@ -5,7 +5,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.pipeline import tilting_poses
+from stillmap.pipeline import tilting_beams
 from stillmap.pipeline.tilting_beams import interpolate_poses, pose_recording
 
 TWIST = np.array([0.8, 0.1, 0.6])  # m/s, m/s, rad/s
@@ -32,7 +32,7 @@ def test_interpolation_along_an_arc():
 
 
 def test_unknown_outside_and_over_gaps(monkeypatch):
-    monkeypatch.setattr(tilting_poses, "MAX_SCAN_GAP", 0.22)
+    monkeypatch.setattr(tilting_beams, "MAX_SCAN_GAP", 0.22)
     at = np.array([-1, 0, 1, 200, 300, 450, 901], np.int64) * 1_000_000
     _, known = interpolate_poses(STAMPS, way(STAMPS), at)
     assert known.tolist() == [False, True, True, True, False, True, False]
