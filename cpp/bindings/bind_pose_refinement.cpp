@@ -58,7 +58,7 @@ auto refine(OccupancyGrid<2>& grid, const Points<2>& points, const Flat<bool>& h
     all.push_back(pose_from<2>(poses.data() + 9 * k));
     require(all.back().R.allFinite() && all.back().t.allFinite(), "poses: not finite");
   }
-  std::vector<ScanRegistrationResult<2>> found;
+  std::vector<ScanRegistrationResult> found;
   {
     nb::gil_scoped_release released;
     found = refine_scans(grid, scans, weights, is_in_map.data(), all, steps, options);

@@ -14,35 +14,41 @@
 namespace stillmap::bindings {
 namespace {
 
-template <int D>
-using Square = nb::ndarray<const double, nb::numpy, nb::shape<Lie<D>::kDof, Lie<D>::kDof>,
-                           nb::c_contig, nb::device::cpu>;
+using Information =
+    nb::ndarray<const double, nb::numpy, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 
+// End points that can be used, and the weights of their beams.
 template <int D>
-WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights) {
+std::pair<std::vector<Vec<D>>, std::vector<double>> weighted_points(const Points<D>& points,
+                                                                    const Flat<float>& weights) {
   const float* w = per_beam(weights, points.shape(0), "weights");
-  WeightedBeams<D> beams;
+  std::pair<std::vector<Vec<D>>, std::vector<double>> usable_points;
   for (size_t n = 0; n < points.shape(0); ++n) {
     const float* p = points.data() + n * D;
     if (!usable<D>(p) || !(w[n] > 0.0f)) continue;
     require(w[n] <= 1.0f, "weights: expected values in [0, 1]");
-    beams.points.push_back(point_at<D>(p));
-    beams.weights.push_back(static_cast<double>(w[n]));
+    usable_points.first.push_back(point_at<D>(p));
+    usable_points.second.push_back(static_cast<double>(w[n]));
   }
+  return usable_points;
+}
+
+WeightedBeams beams_from(const Points<2>& points, const Flat<float>& weights) {
+  WeightedBeams beams;
+  std::tie(beams.points, beams.weights) = weighted_points<2>(points, weights);
   return beams;
 }
 
 // Normals of the beams that `beams_from` kept.
-template <int D>
-void add_normals(WeightedBeams<D>& beams, const Points<D>& points, const Flat<float>& weights,
-                 const Points<D>& normals, const std::optional<Flat<float>>& isotropy) {
+void add_normals(WeightedBeams& beams, const Points<2>& points, const Flat<float>& weights,
+                 const Points<2>& normals, const std::optional<Flat<float>>& isotropy) {
   const size_t n_beams = points.shape(0);
   require(normals.shape(0) == n_beams, "normals: expected as many rows as points has");
   require(isotropy.has_value(), "isotropy: expected along with normals");
   const float* s = per_beam(*isotropy, n_beams, "isotropy");
   for (size_t n = 0; n < n_beams; ++n) {
-    if (!usable<D>(points.data() + n * D) || !(weights.data()[n] > 0.0f)) continue;
-    const Vec<D> normal = point_at<D>(normals.data() + n * D);
+    if (!usable<2>(points.data() + n * 2) || !(weights.data()[n] > 0.0f)) continue;
+    const Vec<2> normal = point_at<2>(normals.data() + n * 2);
     require(normal.allFinite() && s[n] >= 0.0f && s[n] <= 1.0f,
             "normals: expected finite vectors and isotropy in [0, 1]");
     beams.normals.push_back({normal, static_cast<double>(s[n])});
@@ -69,14 +75,13 @@ auto normals_of(const Points<2>& points, double radius, double max_gap, double f
                          to_numpy(std::move(isotropy), {n}));
 }
 
-template <int D>
-auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
-                   const Flat<float>& weights, const OnePose<D>& T_prior,
-                   const Square<D>& information, double sigma, int radius, double floor,
+auto register_scan(const OccupancyGrid<2>& grid, const Points<2>& points,
+                   const Flat<float>& weights, const OnePose<2>& T_prior,
+                   const Information& information, double sigma, int radius, double floor,
                    double unknown, double information_scale, int max_iterations,
                    double window_translation, double window_rotation, double search_range,
-                   int max_candidates, double min_score, const std::optional<OnePose<D>>& T_start,
-                   const std::optional<Points<D>>& normals,
+                   int max_candidates, double min_score, const std::optional<OnePose<2>>& T_start,
+                   const std::optional<Points<2>>& normals,
                    const std::optional<Flat<float>>& isotropy) {
   require(max_candidates >= 1, "max_candidates: expected at least one");
   const ScanRegistrationOptions options{
@@ -85,45 +90,44 @@ auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
   require_probability(min_score, "min_score");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
-  auto beams = beams_from<D>(points, weights);
-  if (normals) add_normals<D>(beams, points, weights, *normals, isotropy);
-  PosePrior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
-  for (int r = 0; r < Lie<D>::kDof; ++r)
-    for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
+  auto beams = beams_from(points, weights);
+  if (normals) add_normals(beams, points, weights, *normals, isotropy);
+  PosePrior prior{checked_pose<2>(T_prior, "T_prior"), {}};
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c) prior.information(r, c) = information(r, c);
   require(prior.information.allFinite(), "information: not finite");
-  std::optional<Pose<D>> given;
-  if (T_start) given = checked_pose<D>(*T_start, "T_start");
-  ScanRegistrationResult<D> best;
+  std::optional<Pose<2>> given;
+  if (T_start) given = checked_pose<2>(*T_start, "T_start");
+  ScanRegistrationResult best;
   best.cost = std::numeric_limits<double>::infinity();
   size_t candidates = 0;
-  std::vector<ScanRegistrationResult<D>> found;
+  std::vector<ScanRegistrationResult> found;
   {
     nb::gil_scoped_release released;
-    LikelihoodField<D> field(grid, options.field);
+    LikelihoodField field(grid, options.field);
     const SearchWindow window{window_translation, window_rotation, search_range, min_score};
-    CorrelativeSearch<D> search(grid, beams, prior, window, options);
-    const auto starting_poses = given ? std::vector<Candidate<D>>{{*given, 0.0}}
+    CorrelativeSearch search(grid, beams, prior, window, options);
+    const auto starting_poses = given ? std::vector<Candidate>{{*given, 0.0}}
                                       : search.best(static_cast<size_t>(max_candidates));
     for (const auto& start : starting_poses) {
-      found.push_back(minimise_levenberg_marquardt<D>(field, beams, prior, start.pose, options));
+      found.push_back(minimise_levenberg_marquardt(field, beams, prior, start.pose, options));
       if (found.back().cost < best.cost) best = found.back();
     }
     candidates = search.poses_tried();
     if (normals)
-      best.information =
-          prior.information + surface_information<D>(field, beams, best.pose, options);
+      best.information = prior.information + surface_information(field, beams, best.pose, options);
   }
-  constexpr size_t n = Lie<D>::kDof;
+  constexpr size_t n = 3;
   std::vector<double> alternatives;
   for (const auto& other : found) {
-    const typename Lie<D>::Tangent apart = other.pose.boxminus(best.pose);
+    const Lie<2>::Tangent apart = other.pose.boxminus(best.pose);
     alternatives.insert(alternatives.end(), apart.data(), apart.data() + n);
     alternatives.push_back(other.cost - best.cost);
   }
-  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof, Eigen::RowMajor> covariance =
+  Eigen::Matrix<double, 3, 3, Eigen::RowMajor> covariance =
       best.information.ldlt().solve(decltype(best.information)::Identity());
   return std::make_tuple(
-      matrix_of<D>(best.pose),
+      matrix_of<2>(best.pose),
       to_numpy(std::vector<double>(covariance.data(), covariance.data() + n * n), {n, n}),
       best.cost, best.inliers, best.iterations, candidates,
       to_numpy(std::move(alternatives), {found.size(), n + 1}));
@@ -135,53 +139,58 @@ double occluded_share_at(const OccupancyGrid<D>& grid, const Points<D>& points,
                          const OnePose<D>& T_sensor, double margin, double min_occupancy) {
   require(margin >= 0.0, "margin: expected a length in metres that is not negative");
   require_probability(min_occupancy, "min_occupancy");
-  const auto beams = beams_from<D>(points, weights);
-  return occluded_share<D>(grid, beams.points, beams.weights, checked_pose<D>(T, "T"),
+  const auto [ends, e] = weighted_points<D>(points, weights);
+  return occluded_share<D>(grid, ends, e, checked_pose<D>(T, "T"),
                            checked_pose<D>(T_sensor, "T_sensor").t, margin, min_occupancy);
 }
 
-// Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
 template <int D>
-QuadraticModel<D> data_term(const OccupancyGrid<D>& grid, const Points<D>& points,
-                            const Flat<float>& weights, const OnePose<D>& T,
-                            const LikelihoodFieldOptions& field_options,
-                            const std::optional<Points<D>>& normals,
-                            const std::optional<Flat<float>>& isotropy) {
-  auto beams = beams_from<D>(points, weights);
-  const Pose<D> pose = checked_pose<D>(T, "T");
-  LikelihoodField<D> field(grid, field_options);
+void bind_occluded_share(nb::module_& m) {
+  m.def("occluded_share", &occluded_share_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
+        nb::kw_only(), nb::arg("margin"), nb::arg("min_occupancy"),
+        "Weighted share of beams, from a sensor at T T_sensor to the points at T, that cross a "
+        "cell of occupancy >= min_occupancy more than `margin` metres before their end.");
+}
+
+// Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
+QuadraticModel data_term(const OccupancyGrid<2>& grid, const Points<2>& points,
+                         const Flat<float>& weights, const OnePose<2>& T,
+                         const LikelihoodFieldOptions& field_options,
+                         const std::optional<Points<2>>& normals,
+                         const std::optional<Flat<float>>& isotropy) {
+  auto beams = beams_from(points, weights);
+  const Pose<2> pose = checked_pose<2>(T, "T");
+  LikelihoodField field(grid, field_options);
   if (normals) {
-    add_normals<D>(beams, points, weights, *normals, isotropy);
-    mark_beyond_map<D>(field, beams, pose);
+    add_normals(beams, points, weights, *normals, isotropy);
+    mark_beyond_map(field, beams, pose);
   }
-  auto q = linearise<D>(field, beams, pose, {field_options, 1.0, 0});
+  auto q = linearise(field, beams, pose, {field_options, 1.0, 0});
   for (const double w : beams.weights) q.cost -= w * std::log(field_options.floor + 1.0);
   return q;
 }
 
-template <int D>
-double cost_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-               const OnePose<D>& T, double sigma, int radius, double floor, double unknown,
-               const std::optional<Points<D>>& normals,
+double cost_at(const OccupancyGrid<2>& grid, const Points<2>& points, const Flat<float>& weights,
+               const OnePose<2>& T, double sigma, int radius, double floor, double unknown,
+               const std::optional<Points<2>>& normals,
                const std::optional<Flat<float>>& isotropy) {
   const LikelihoodFieldOptions options{sigma, radius, floor, unknown};
-  return data_term<D>(grid, points, weights, T, options, normals, isotropy).cost;
+  return data_term(grid, points, weights, T, options, normals, isotropy).cost;
 }
 
-template <int D>
-auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-                 const OnePose<D>& T, double sigma, int radius, double floor, double unknown,
-                 const std::optional<Points<D>>& normals,
+auto gradient_at(const OccupancyGrid<2>& grid, const Points<2>& points, const Flat<float>& weights,
+                 const OnePose<2>& T, double sigma, int radius, double floor, double unknown,
+                 const std::optional<Points<2>>& normals,
                  const std::optional<Flat<float>>& isotropy) {
   const LikelihoodFieldOptions options{sigma, radius, floor, unknown};
-  const auto q = data_term<D>(grid, points, weights, T, options, normals, isotropy);
-  const size_t n = Lie<D>::kDof;
+  const auto q = data_term(grid, points, weights, T, options, normals, isotropy);
+  const size_t n = 3;
   return to_numpy(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
 }
 
-template <int D>
-void bind(nb::module_& m) {
-  m.def("register_scan", &register_scan<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+void bind_registration(nb::module_& m) {
+  m.def("register_scan", &register_scan, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
         nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
         nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"),
@@ -189,29 +198,24 @@ void bind(nb::module_& m) {
         nb::arg("search_range"), nb::arg("max_candidates"), nb::arg("min_score") = 0.0,
         nb::arg("T_start") = nb::none(), nb::arg("normals").noconvert() = nb::none(),
         nb::arg("isotropy").noconvert() = nb::none(),
-        "Equation (9): scan-to-map registration. points (N, D) float32: end points of returns in "
-        "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and information (dof, dof) "
+        "Equation (9): scan-to-map registration. points (N, 2) float32: end points of returns in "
+        "the moving frame; weights (N,) float32 = e; T_prior (3, 3) and information (3, 3) "
         "of (translation, rotation about the origin of the moving frame). A correlative search "
         "yields up to max_candidates poses, each refined by Newton steps; none that scores less "
         "than min_score of the highest possible score, in which case T_prior is refined. With "
         "T_start the search is skipped. Returns pose, covariance, cost, inlier share, number of "
         "Newton steps, number of scored lattice poses, and (R, dof + 1) offset and additional cost "
         "of each refined "
-        "candidate against the best. With normals (N, D) and isotropy (N,) of `estimate_normals`, "
+        "candidate against the best. With normals (N, 2) and isotropy (N,) of `estimate_normals`, "
         "the covariance is that of the surfaces' directions, and wide along a bare wall.");
-  m.def("occluded_share", &occluded_share_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
-        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
-        nb::kw_only(), nb::arg("margin"), nb::arg("min_occupancy"),
-        "Weighted share of beams, from a sensor at T T_sensor to the points at T, that cross a "
-        "cell of occupancy >= min_occupancy more than `margin` metres before their end.");
-  m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+  m.def("registration_cost", &cost_at, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
         nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
         "Cost -sum w ln(floor + unknown U + F) at one pose, with the likelihood field F and U = 1 "
-        "in unobserved cells. With normals (N, D) and isotropy (N,), in 2D, F of an end point "
+        "in unobserved cells. With normals (N, 2) and isotropy (N,), F of an end point "
         "where the mapped part of a flat surface ends depends on the distance from it only.");
-  m.def("registration_gradient", &gradient_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+  m.def("registration_gradient", &gradient_at, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
         nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
@@ -229,8 +233,9 @@ void bind_scan_registration(nb::module_& m) {
         "within `radius` metres, each at most `max_gap` from the one before. Isotropy rises from 0 "
         "to 1 as the ratio of the variances across and along rises from flat_below to round_from. "
         "With fewer than two neighbours the normal is zero.");
-  bind<2>(m);
-  bind<3>(m);
+  bind_registration(m);
+  bind_occluded_share<2>(m);
+  bind_occluded_share<3>(m);
 }
 
 }  // namespace stillmap::bindings

@@ -25,17 +25,15 @@ struct SearchWindow {
   double min_score;    // share of the highest possible score below which no pose counts
 };
 
-template <int D>
 struct Candidate {
-  Pose<D> pose;
+  Pose<2> pose;
   double score;
 };
 
-template <int D>
 class CorrelativeSearch {
  public:
-  CorrelativeSearch(const OccupancyGrid<D>& grid, const WeightedBeams<D>& beams,
-                    const PosePrior<D>& prior, const SearchWindow& window,
+  CorrelativeSearch(const OccupancyGrid<2>& grid, const WeightedBeams& beams,
+                    const PosePrior& prior, const SearchWindow& window,
                     const ScanRegistrationOptions& options)
       : grid_(grid), prior_(prior), options_(options) {
     // a wide window is searched in steps of two cells, within reach of the local optimisation
@@ -61,18 +59,18 @@ class CorrelativeSearch {
                  std::log((options.field.floor + 1.0) / options.field.floor) / kWeight *
                  static_cast<double>(std::accumulate(weights_.begin(), weights_.end(), int64_t{0}));
     while (top_level_ < kMaxTopLevel && (2 << top_level_) <= half_steps_) ++top_level_;
-    const Eigen::Matrix<double, D, D> A = prior.information.template topLeftCorner<D, D>();
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen(A);
+    const Eigen::Matrix2d A = prior.information.topLeftCorner<2, 2>();
+    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen(A);
     min_shift_information_ = std::max(eigen.eigenvalues()[0], 0.0);
-    shift_per_turn_ = A.ldlt().solve(prior.information.template topRightCorner<D, 1>());
+    shift_per_turn_ = A.ldlt().solve(prior.information.topRightCorner<2, 1>());
   }
 
   // Best lattice poses, best first, pairwise in different basins and none below 0.8 of the best
   // score; the prior's mean if the window is empty or no pose reaches the lowest score.
-  std::vector<Candidate<D>> best(size_t max_candidates) {
+  std::vector<Candidate> best(size_t max_candidates) {
     if (points_.empty() || (half_steps_ == 0 && half_angles_ == 0)) return {{prior_.pose, 0.0}};
     build_pyramid();
-    std::vector<Candidate<D>> candidates;
+    std::vector<Candidate> candidates;
     size_t limit = std::numeric_limits<size_t>::max();
     while (!queue_.empty() && candidates.size() < max_candidates && poses_tried_ < limit) {
       const Node node = queue_.top();
@@ -83,7 +81,7 @@ class CorrelativeSearch {
         branch(node);
         continue;
       }
-      const Candidate<D> candidate{pose_at(node), node.bound};
+      const Candidate candidate{pose_at(node), node.bound};
       if (std::any_of(candidates.begin(), candidates.end(),
                       [&](const auto& other) { return is_same_basin(candidate.pose, other.pose); }))
         continue;
@@ -106,28 +104,27 @@ class CorrelativeSearch {
     double bound;  // upper bound of the score; at level 0, the score
     int level;
     int angle;
-    Cell<D> low;
+    Cell<2> low;
     size_t order;  // breaks ties by age, for determinism
     bool operator<(const Node& other) const {
       return bound != other.bound ? bound < other.bound : order > other.order;
     }
   };
 
-  bool is_same_basin(const Pose<D>& a, const Pose<D>& b) const {
-    const typename Lie<D>::Tangent d = a.boxminus(b);
-    return d.template head<D>().norm() < 3.0 * step_ &&
-           d.template tail<Lie<D>::kRotation>().norm() < 3.0 * angle_step_;
+  bool is_same_basin(const Pose<2>& a, const Pose<2>& b) const {
+    const Lie<2>::Tangent d = a.boxminus(b);
+    return d.head<2>().norm() < 3.0 * step_ && d.tail<1>().norm() < 3.0 * angle_step_;
   }
 
-  Pose<D> rotated_prior(int a) const {
-    typename Lie<D>::Tangent delta = Lie<D>::Tangent::Zero();
-    delta[Lie<D>::kDof - 1] = a * angle_step_;
+  Pose<2> rotated_prior(int a) const {
+    Lie<2>::Tangent delta = Lie<2>::Tangent::Zero();
+    delta[3 - 1] = a * angle_step_;
     return prior_.pose.boxplus(delta);
   }
 
-  Pose<D> pose_at(const Node& node) const {
-    Pose<D> pose = rotated_prior(node.angle);
-    pose.t += node.low.template cast<double>() * step_;
+  Pose<2> pose_at(const Node& node) const {
+    Pose<2> pose = rotated_prior(node.angle);
+    pose.t += node.low.cast<double>() * step_;
     return pose;
   }
 
@@ -135,42 +132,42 @@ class CorrelativeSearch {
   // nodes.
   void build_pyramid() {
     const auto turns = static_cast<size_t>(2 * half_angles_ + 1);
-    std::vector<Cell<D>> pixels;
+    std::vector<Cell<2>> pixels;
     pixels.reserve(turns * points_.size());
-    Cell<D> low = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
-    Cell<D> high = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
+    Cell<2> low = Cell<2>::Constant(std::numeric_limits<int32_t>::max());
+    Cell<2> high = Cell<2>::Constant(std::numeric_limits<int32_t>::min());
     for (int a = -half_angles_; a <= half_angles_; ++a) {
-      const Pose<D> pose = rotated_prior(a);
+      const Pose<2> pose = rotated_prior(a);
       for (const auto& p : points_) {
-        pixels.push_back(cell_of<D>((pose * p) / step_));
+        pixels.push_back(cell_of<2>((pose * p) / step_));
         low = low.cwiseMin(pixels.back());
         high = high.cwiseMax(pixels.back());
       }
     }
     // root nodes may reach beyond the window
-    const Cell<D> before = Cell<D>::Constant(half_steps_),
-                  after = Cell<D>::Constant(half_steps_ + 1);
+    const Cell<2> before = Cell<2>::Constant(half_steps_),
+                  after = Cell<2>::Constant(half_steps_ + 1);
     pyramid_.emplace(grid_, low - before, high - low + before + after, step_shift_, top_level_,
                      options_.field);
     for (const auto& pixel : pixels) pixel_indices_.push_back(pyramid_->index(pixel));
-    const Cell<D> last_node = Cell<D>::Constant(2 * half_steps_ >> top_level_),
-                  none = Cell<D>::Zero();
+    const Cell<2> last_node = Cell<2>::Constant(2 * half_steps_ >> top_level_),
+                  none = Cell<2>::Zero();
     for (int a = -half_angles_; a <= half_angles_; ++a)
-      for_each_in_box<D>(none, last_node, [&](const Cell<D>& node) {
+      for_each_in_box<2>(none, last_node, [&](const Cell<2>& node) {
         push_node(top_level_, a, (node.array() * (1 << top_level_) - half_steps_).matrix());
       });
   }
 
   void branch(const Node& node) {
     const int32_t half = 1 << (node.level - 1);
-    for (int child = 0; child < 1 << D; ++child) {
-      Cell<D> low = node.low;
-      for (int d = 0; d < D; ++d) low[d] += (child >> d & 1) * half;
+    for (int child = 0; child < 4; ++child) {
+      Cell<2> low = node.low;
+      for (int d = 0; d < 2; ++d) low[d] += (child >> d & 1) * half;
       if ((low.array() <= half_steps_).all()) push_node(node.level - 1, node.angle, low);
     }
   }
 
-  void push_node(int level, int angle, const Cell<D>& low) {
+  void push_node(int level, int angle, const Cell<2>& low) {
     ++poses_tried_;
     const int64_t shift = pyramid_->offset(low);
     const uint8_t* from = pyramid_->level(level) + shift;
@@ -186,25 +183,25 @@ class CorrelativeSearch {
 
   // 1/2 d^T Lambda d of a pose; for a node a lower bound: at a given angle the rest is a quadratic
   // form about some shift.
-  double prior_penalty(int level, int angle, const Cell<D>& low) const {
-    constexpr int turn = Lie<D>::kDof - 1;
+  double prior_penalty(int level, int angle, const Cell<2>& low) const {
+    constexpr int turn = 3 - 1;
     const double theta = angle * angle_step_;
-    Vec<D> shift = low.template cast<double>() * step_;
-    const auto A = prior_.information.template topLeftCorner<D, D>();
-    const Vec<D> b = prior_.information.template topRightCorner<D, 1>();
+    Vec<2> shift = low.cast<double>() * step_;
+    const auto A = prior_.information.topLeftCorner<2, 2>();
+    const Vec<2> b = prior_.information.topRightCorner<2, 1>();
     if (level == 0)
       return 0.5 * (shift.dot(A * shift) + 2.0 * theta * shift.dot(b) +
                     theta * theta * prior_.information(turn, turn));
-    const Vec<D> opposite = shift.array() + ((1 << level) - 1) * step_;
-    const Vec<D> nearest = (-theta * shift_per_turn_).cwiseMax(shift).cwiseMin(opposite);
+    const Vec<2> opposite = shift.array() + ((1 << level) - 1) * step_;
+    const Vec<2> nearest = (-theta * shift_per_turn_).cwiseMax(shift).cwiseMin(opposite);
     return 0.5 * (min_shift_information_ * (nearest + theta * shift_per_turn_).squaredNorm() +
                   theta * theta * (prior_.information(turn, turn) - b.dot(shift_per_turn_)));
   }
 
-  const OccupancyGrid<D>& grid_;
-  const PosePrior<D>& prior_;
+  const OccupancyGrid<2>& grid_;
+  const PosePrior& prior_;
   const ScanRegistrationOptions& options_;
-  std::vector<Vec<D>> points_;
+  std::vector<Vec<2>> points_;
   std::vector<int32_t> weights_;
   int step_shift_ = 0;  // a step is 2^step_shift_ cells
   double step_ = 0.0;
@@ -213,10 +210,10 @@ class CorrelativeSearch {
   double min_score_ = 0.0;  // nats
   int half_angles_ = 0;
   int top_level_ = 0;  // level of the root nodes
-  std::optional<FieldPyramid<D>> pyramid_;
+  std::optional<FieldPyramid> pyramid_;
   std::vector<int64_t> pixel_indices_;  // pixel of every beam, angle by angle
   std::priority_queue<Node> queue_;
-  Vec<D> shift_per_turn_;               // optimal shift per radian of rotation, negated
+  Vec<2> shift_per_turn_;               // optimal shift per radian of rotation, negated
   double min_shift_information_ = 0.0;  // smallest eigenvalue of the prior's
   size_t poses_tried_ = 0;
 };

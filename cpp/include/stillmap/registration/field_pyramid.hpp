@@ -18,14 +18,13 @@ namespace stillmap {
 // Level 0 has ln((floor + F) / floor) at the pixels of a box, quantised in units of score_unit(); F
 // is the largest single Gaussian. A pixel is 2^shift cells wide. Level h has the maximum over the
 // 2^h pixels that start at a pixel along each axis; outside the box F is 0.
-template <int D>
 class FieldPyramid {
  public:
-  FieldPyramid(const OccupancyGrid<D>& grid, const Cell<D>& first, const Cell<D>& size, int shift,
+  FieldPyramid(const OccupancyGrid<2>& grid, const Cell<2>& first, const Cell<2>& size, int shift,
                int levels, const LikelihoodFieldOptions& options)
       : first_(first), size_(size), shift_(shift) {
     levels_.resize(static_cast<size_t>(levels) + 1);
-    levels_[0].assign(static_cast<size_t>(size.template cast<int64_t>().prod()), 0);
+    levels_[0].assign(static_cast<size_t>(size.cast<int64_t>().prod()), 0);
     // wider than the field of the optimiser, since a pixel stands for its whole area
     const double pixel = grid.resolution() * (1 << shift);
     splat_grid(grid, std::max(1.5 * options.sigma / pixel, 1.0));
@@ -45,17 +44,15 @@ class FieldPyramid {
   const uint8_t* level(int h) const { return levels_[static_cast<size_t>(h)].data(); }
 
   // x fastest; the pixel must be inside the box.
-  int64_t index(const Cell<D>& pixel) const { return offset(pixel - first_); }
+  int64_t index(const Cell<2>& pixel) const { return offset(pixel - first_); }
 
   // Difference of the indices of two pixels.
-  int64_t offset(const Cell<D>& difference) const {
-    int64_t i = 0;
-    for (int d = D - 1; d >= 0; --d) i = i * size_[d] + difference[d];
-    return i;
+  int64_t offset(const Cell<2>& difference) const {
+    return difference[0] + int64_t{size_[0]} * difference[1];
   }
 
  private:
-  using Block = typename OccupancyGrid<D>::Block;
+  using Block = OccupancyGrid<2>::Block;
   static constexpr double kMaxScore = 255.0;
 
   // Maxima over windows of twice the size, axis by axis.
@@ -63,7 +60,7 @@ class FieldPyramid {
                 std::vector<uint8_t>& target) const {
     target = source;
     int64_t stride = 1;
-    for (int d = 0; d < D; ++d) {
+    for (int d = 0; d < 2; ++d) {
       const int64_t line = stride * size_[d];
       const int64_t n_kept = line - stride * std::min<int64_t>(radius, size_[d]);
       for (int64_t begin = 0; begin < static_cast<int64_t>(target.size()); begin += line) {
@@ -75,29 +72,25 @@ class FieldPyramid {
     }
   }
 
-  Cell<D> pixel_of(const Cell<D>& cell) const {
-    Cell<D> pixel;
-    for (int d = 0; d < D; ++d) pixel[d] = cell[d] >> shift_;
-    return pixel;
-  }
+  Cell<2> pixel_of(const Cell<2>& cell) const { return {cell[0] >> shift_, cell[1] >> shift_}; }
 
   // Calls visit(block, first local index, first cell) for each row along x of the blocks with end
   // points within `margin` pixels of the box.
   template <class Visit>
-  void for_each_row(const OccupancyGrid<D>& grid, int margin, Visit&& visit) const {
-    const Cell<D> low = (first_.array() - margin) * (1 << shift_);
-    const Cell<D> high = (first_ + size_).array() * (1 << shift_) + margin * (1 << shift_);
-    for_each_in_box<D>(
-        BlockLayout<D>::block_of(low), BlockLayout<D>::block_of(high), [&](const Cell<D>& b) {
+  void for_each_row(const OccupancyGrid<2>& grid, int margin, Visit&& visit) const {
+    const Cell<2> low = (first_.array() - margin) * (1 << shift_);
+    const Cell<2> high = (first_ + size_).array() * (1 << shift_) + margin * (1 << shift_);
+    for_each_in_box<2>(
+        BlockLayout<2>::block_of(low), BlockLayout<2>::block_of(high), [&](const Cell<2>& b) {
           const Block* block = grid.find(b);
           if (!block || !block->moments) return;
-          for (int i = 0; i < BlockLayout<D>::kCells; i += BlockLayout<D>::kEdge)
-            visit(*block, static_cast<size_t>(i), BlockLayout<D>::cell_at(block->origin, i));
+          for (int i = 0; i < BlockLayout<2>::kCells; i += BlockLayout<2>::kEdge)
+            visit(*block, static_cast<size_t>(i), BlockLayout<2>::cell_at(block->origin, i));
         });
   }
 
   // Maximum over cells of m_k exp(-|pixel - cell|^2 / (2 sigma^2)), sigma in pixels.
-  void splat_grid(const OccupancyGrid<D>& grid, double sigma) {
+  void splat_grid(const OccupancyGrid<2>& grid, double sigma) {
     const int radius = static_cast<int>(std::ceil(2.0 * sigma)), kernel_size = 2 * radius + 1;
     // per axis: [position of the cell in its pixel][distance of the pixel]
     std::vector<float> kernel;
@@ -106,31 +99,30 @@ class FieldPyramid {
         const double d = k + 0.5 - (subpixel + 0.5) / (1 << shift_);
         kernel.push_back(static_cast<float>(std::exp(-0.5 * d * d / (sigma * sigma))));
       }
-    for_each_row(grid, radius, [&](const Block& block, size_t first, const Cell<D>& row) {
-      Cell<D> cell = row;
-      for (size_t x = 0; x < BlockLayout<D>::kEdge; ++x, ++cell[0])
+    for_each_row(grid, radius, [&](const Block& block, size_t first, const Cell<2>& row) {
+      Cell<2> cell = row;
+      for (size_t x = 0; x < BlockLayout<2>::kEdge; ++x, ++cell[0])
         if (block.values[first + x].alpha > 0)
-          splat(cell, OccupancyGrid<D>::occupancy_ignoring_approach(block, first + x), kernel,
+          splat(cell, OccupancyGrid<2>::occupancy_ignoring_approach(block, first + x), kernel,
                 radius, kernel_size);
     });
   }
 
-  void splat(const Cell<D>& cell, double m, const std::vector<float>& kernel, int radius,
+  void splat(const Cell<2>& cell, double m, const std::vector<float>& kernel, int radius,
              int kernel_size) {
-    const Cell<D> pixel = pixel_of(cell);
-    const Cell<D> low = (pixel.array() - radius).max(first_.array());
-    Cell<D> high = (pixel.array() + radius).min((first_ + size_).array() - 1);
+    const Cell<2> pixel = pixel_of(cell);
+    const Cell<2> low = (pixel.array() - radius).max(first_.array());
+    Cell<2> high = (pixel.array() + radius).min((first_ + size_).array() - 1);
     if ((low.array() > high.array()).any()) return;
-    std::array<const float*, D> axis_kernel;  // kernel of each axis at pixel low
-    for (int d = 0; d < D; ++d)
+    std::array<const float*, 2> axis_kernel;  // kernel of each axis at pixel low
+    for (int d = 0; d < 2; ++d)
       axis_kernel[static_cast<size_t>(d)] = kernel.data() +
                                             (cell[d] - pixel[d] * (1 << shift_)) * kernel_size +
                                             (low[d] - pixel[d] + radius);
     const int32_t width = high[0] - low[0] + 1;
     high[0] = low[0];  // whole rows along x
-    for_each_in_box<D>(low, high, [&](const Cell<D>& row) {
-      auto weight = static_cast<float>(m * kMaxScore);
-      for (int d = 1; d < D; ++d) weight *= axis_kernel[static_cast<size_t>(d)][row[d] - low[d]];
+    for_each_in_box<2>(low, high, [&](const Cell<2>& row) {
+      const float weight = static_cast<float>(m * kMaxScore) * axis_kernel[1][row[1] - low[1]];
       uint8_t* target = levels_[0].data() + index(row);
       for (int32_t x = 0; x < width; ++x)
         target[x] = std::max(
@@ -138,7 +130,7 @@ class FieldPyramid {
     });
   }
 
-  Cell<D> first_, size_;
+  Cell<2> first_, size_;
   int shift_;
   double score_unit_ = 0.0;
   std::vector<std::vector<uint8_t>> levels_;

@@ -24,37 +24,34 @@ struct LikelihoodFieldOptions {
   double unknown;  // added to the floor in unobserved space
 };
 
-template <int D>
 struct FieldSample {
   double value = 0.0;     // F(y), about 1 on a wall
   double baseline = 0.0;  // of an unexplained end point: floor (+ unknown if unobserved)
-  Vec<D> log_gradient = Vec<D>::Zero();  // gradient of ln F: mean of (mu_k - y) / sigma^2, 1/m
+  Vec<2> log_gradient = Vec<2>::Zero();  // gradient of ln F: mean of (mu_k - y) / sigma^2, 1/m
   // Covariance of (mu_k - y) / sigma^2: cancels sigma^-2 along a wall, where F is constant.
-  Eigen::Matrix<double, D, D> pull_covariance = Eigen::Matrix<double, D, D>::Zero();
+  Eigen::Matrix2d pull_covariance = Eigen::Matrix2d::Zero();
 };
 
 // Gaussians around one cell, cached for a beam while its end point stays in the cell.
-template <int D>
 struct GaussianWindow {
   struct Gaussian {
-    Vec<D> mean;    // cells
+    Vec<2> mean;    // cells
     double weight;  // m_k, OccupancyGrid::occupancy_ignoring_approach
   };
-  Cell<D> centre = Cell<D>::Zero();
+  Cell<2> centre = Cell<2>::Zero();
   bool valid = false;
   bool observed = false;
   bool is_planar = false;               // the means lie on a line or plane
-  Vec<D> normal = Vec<D>::Zero();       // of that plane
-  Vec<D> plane_point = Vec<D>::Zero();  // on that plane, in cells
+  Vec<2> normal = Vec<2>::Zero();       // of that plane
+  Vec<2> plane_point = Vec<2>::Zero();  // on that plane, in cells
   double mean_occupancy = 0.0;          // of the cells
   double baseline = 0.0;
   std::vector<Gaussian> gaussians;
 };
 
-template <int D>
 class LikelihoodField {
  public:
-  LikelihoodField(const OccupancyGrid<D>& grid, const LikelihoodFieldOptions& options)
+  LikelihoodField(const OccupancyGrid<2>& grid, const LikelihoodFieldOptions& options)
       : cursor_(grid), options_(options), resolution_(grid.resolution()) {
     if (!(options.sigma > 0.0)) throw std::invalid_argument("sigma: expected a positive length");
     if (!(options.floor > 0.0)) throw std::invalid_argument("floor: expected a positive number");
@@ -70,21 +67,21 @@ class LikelihoodField {
     truncated_variance_ = 1.0 - 2.0 * cut * density / std::erf(cut / std::sqrt(2.0));
     exponent_ = -0.5 / (sigma_cells * sigma_cells);
     // F = 1 on a straight wall of fully occupied cells
-    norm_ = 1.0 / std::pow(std::sqrt(2.0 * kPi) * sigma_cells, D - 1);
+    norm_ = 1.0 / (std::sqrt(2.0 * kPi) * sigma_cells);
   }
 
-  FieldSample<D> evaluate(const Vec<D>& point, GaussianWindow<D>& window) {
-    FieldSample<D> sample;
+  FieldSample evaluate(const Vec<2>& point, GaussianWindow& window) {
+    FieldSample sample;
     sample.baseline = options_.floor;
-    const Vec<D> y = point / resolution_;
+    const Vec<2> y = point / resolution_;
     if (!gather_around(y, window)) return sample;
     sample.baseline = window.baseline;
     if (!window.observed && window.is_planar) return extrapolate(y, window);
     double sum = 0.0;
-    Vec<D> first = Vec<D>::Zero();
-    Eigen::Matrix<double, D, D> second = Eigen::Matrix<double, D, D>::Zero();
+    Vec<2> first = Vec<2>::Zero();
+    Eigen::Matrix2d second = Eigen::Matrix2d::Zero();
     for (const auto& gaussian : window.gaussians) {
-      const Vec<D> to_mean = gaussian.mean - y;
+      const Vec<2> to_mean = gaussian.mean - y;
       const double weight = gaussian.weight * std::exp(exponent_ * to_mean.squaredNorm());
       sum += weight;
       first += weight * to_mean;
@@ -103,27 +100,27 @@ class LikelihoodField {
 
   // Whether the mapped part of a surface ends at a point: in the direction of a unit tangent there
   // are no occupied cells, and the cell beyond the radius is unobserved.
-  bool is_end_of_mapped_surface(const Vec<D>& point, const Vec<D>& tangent,
-                                GaussianWindow<D>& window) {
-    const Vec<D> y = point / resolution_;
+  bool is_end_of_mapped_surface(const Vec<2>& point, const Vec<2>& tangent,
+                                GaussianWindow& window) {
+    const Vec<2> y = point / resolution_;
     if (!gather_around(y, window)) return false;
     constexpr double kReach = 0.5;  // cells
     for (const auto& gaussian : window.gaussians)
       if (tangent.dot(gaussian.mean - y) >= kReach) return false;
-    return !cursor_.find_observed(cell_of<D>(y + tangent * (options_.radius + 1.0)));
+    return !cursor_.find_observed(cell_of<2>(y + tangent * (options_.radius + 1.0)));
   }
 
   // The field at the end of the mapped part of a flat surface (unit normal): it depends on the
   // distance from the surface only, not on the position along it.
-  FieldSample<D> evaluate_beyond_map(const Vec<D>& point, const Vec<D>& normal,
-                                     GaussianWindow<D>& window) {
-    FieldSample<D> sample;
+  FieldSample evaluate_beyond_map(const Vec<2>& point, const Vec<2>& normal,
+                                  GaussianWindow& window) {
+    FieldSample sample;
     sample.baseline = options_.floor;
-    const Vec<D> y = point / resolution_;
+    const Vec<2> y = point / resolution_;
     if (!gather_around(y, window)) return sample;
     sample.baseline = window.baseline;
     double total = 0.0;
-    Vec<D> mean = Vec<D>::Zero();
+    Vec<2> mean = Vec<2>::Zero();
     for (const auto& gaussian : window.gaussians) {
       total += gaussian.weight;
       mean += gaussian.weight * gaussian.mean;
@@ -135,21 +132,21 @@ class LikelihoodField {
 
  private:
   // Fills the window of a point in cells; false where the point is out of range.
-  bool gather_around(const Vec<D>& y, GaussianWindow<D>& window) {
-    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return false;
-    gather_gaussians(cell_of<D>(y), window);
+  bool gather_around(const Vec<2>& y, GaussianWindow& window) {
+    if (!all_below<2>(y, BlockLayout<2>::kMaxCell - 64)) return false;
+    gather_gaussians(cell_of<2>(y), window);
     return true;
   }
 
   // Extends a surface into unobserved space: the end of the mapped part must not pull scans along
   // it.
-  FieldSample<D> extrapolate(const Vec<D>& y, const GaussianWindow<D>& window) const {
+  FieldSample extrapolate(const Vec<2>& y, const GaussianWindow& window) const {
     return on_plane(y, window.normal, window.plane_point, window.mean_occupancy, window.baseline);
   }
 
-  FieldSample<D> on_plane(const Vec<D>& y, const Vec<D>& normal, const Vec<D>& plane_point,
-                          double occupancy, double baseline) const {
-    FieldSample<D> sample;
+  FieldSample on_plane(const Vec<2>& y, const Vec<2>& normal, const Vec<2>& plane_point,
+                       double occupancy, double baseline) const {
+    FieldSample sample;
     sample.baseline = baseline;
     const double distance = normal.dot(plane_point - y);
     const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
@@ -161,32 +158,30 @@ class LikelihoodField {
     return sample;
   }
 
-  void fit_plane(GaussianWindow<D>& window) const {
+  void fit_plane(GaussianWindow& window) const {
     window.is_planar = false;
-    if (window.gaussians.size() < D) return;
+    if (window.gaussians.size() < 2) return;
     double total = 0.0;
-    Vec<D> mean = Vec<D>::Zero();
+    Vec<2> mean = Vec<2>::Zero();
     for (const auto& g : window.gaussians) {
       total += g.weight;
       mean += g.weight * g.mean;
     }
     if (!(total > 0.0)) return;
     mean /= total;
-    Eigen::Matrix<double, D, D> covariance = Eigen::Matrix<double, D, D>::Zero();
+    Eigen::Matrix2d covariance = Eigen::Matrix2d::Zero();
     for (const auto& g : window.gaussians)
       covariance += (g.weight / total) * (g.mean - mean) * (g.mean - mean).transpose();
-    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
+    Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen;
     eigen.computeDirect(covariance);
-    const Vec<D> variance = eigen.eigenvalues();
-    // a line in 3D lies on many planes
-    window.is_planar =
-        variance[0] < 0.1 * variance[1] && (D == 2 || variance[1] > 0.1 * variance[D - 1]);
+    const Vec<2> variance = eigen.eigenvalues();
+    window.is_planar = variance[0] < 0.1 * variance[1];
     window.normal = eigen.eigenvectors().col(0);
     window.plane_point = mean;
     window.mean_occupancy = total / static_cast<double>(window.gaussians.size());
   }
 
-  void gather_gaussians(const Cell<D>& centre, GaussianWindow<D>& window) {
+  void gather_gaussians(const Cell<2>& centre, GaussianWindow& window) {
     if (window.valid && window.centre == centre) return;
     window.centre = centre;
     window.valid = true;
@@ -194,45 +189,36 @@ class LikelihoodField {
     window.baseline = options_.floor + (window.observed ? 0.0 : options_.unknown);
     window.gaussians.clear();
     const int radius = options_.radius;
-    Cell<D> row = centre.array() - radius;
-    while (true) {
-      gather_row(row, centre[0] + radius, window.gaussians);
-      int d = 1;
-      for (; d < D; ++d) {
-        if (++row[d] <= centre[d] + radius) break;
-        row[d] = centre[d] - radius;
-      }
-      if (d == D) break;
-    }
+    for (int32_t y = centre[1] - radius; y <= centre[1] + radius; ++y)
+      gather_row({centre[0] - radius, y}, centre[0] + radius, window.gaussians);
     if (!window.observed) fit_plane(window);
   }
 
   // Adds the Gaussians of a row of cells along x up to `last`, block by block.
-  void gather_row(Cell<D> cell, int32_t last,
-                  std::vector<typename GaussianWindow<D>::Gaussian>& gaussians) {
+  void gather_row(Cell<2> cell, int32_t last, std::vector<GaussianWindow::Gaussian>& gaussians) {
     while (cell[0] <= last) {
       const auto* block = cursor_.block(cell);
-      const int32_t row_end = std::min(last, cell[0] | (BlockLayout<D>::kEdge - 1));
+      const int32_t row_end = std::min(last, cell[0] | (BlockLayout<2>::kEdge - 1));
       if (block && block->moments) {
-        auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
-        for (Cell<D> current = cell; current[0] <= row_end; ++current[0], ++local)
+        auto local = static_cast<size_t>(BlockLayout<2>::local_of(cell));
+        for (Cell<2> current = cell; current[0] <= row_end; ++current[0], ++local)
           if (block->values[local].alpha > 0) gaussians.push_back(gaussian(*block, local, current));
       }
       cell[0] = row_end + 1;
     }
   }
 
-  static typename GaussianWindow<D>::Gaussian gaussian(
-      const typename OccupancyGrid<D>::Block& block, size_t local, const Cell<D>& cell) {
+  static GaussianWindow::Gaussian gaussian(const OccupancyGrid<2>::Block& block, size_t local,
+                                           const Cell<2>& cell) {
     const double per_hit = 1.0 / static_cast<double>(block.values[local].alpha);
-    Vec<D> mean;
-    for (int d = 0; d < D; ++d)
+    Vec<2> mean;
+    for (int d = 0; d < 2; ++d)
       mean[d] =
           cell[d] + per_hit * static_cast<double>((*block.moments)[local][static_cast<size_t>(d)]);
-    return {mean, OccupancyGrid<D>::occupancy_ignoring_approach(block, local)};
+    return {mean, OccupancyGrid<2>::occupancy_ignoring_approach(block, local)};
   }
 
-  BlockCursor<const OccupancyGrid<D>> cursor_;
+  BlockCursor<const OccupancyGrid<2>> cursor_;
   LikelihoodFieldOptions options_;
   double resolution_;
   double exponent_;

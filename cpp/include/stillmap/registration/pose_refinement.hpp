@@ -76,8 +76,8 @@ inline void add_hits(OccupancyGrid<2>& grid, const ScanBeams& scan, const Pose<2
 }
 
 // The hits of a scan with their normals, in the base frame.
-inline WeightedBeams<2> collect_hits(const ScanBeams& scan, const NormalOptions& options) {
-  WeightedBeams<2> beams;
+inline WeightedBeams collect_hits(const ScanBeams& scan, const NormalOptions& options) {
+  WeightedBeams beams;
   for (int64_t n = 0; n < scan.n_beams; ++n) {
     if (!scan.hit[n] || !usable<2>(scan.points + 2 * n) || !(scan.e[n] > 0.0f)) continue;
     const Vec<2> point = scan.T_base_sensor * point_at<2>(scan.points + 2 * n);
@@ -90,9 +90,9 @@ inline WeightedBeams<2> collect_hits(const ScanBeams& scan, const NormalOptions&
 
 // Product of the Gaussians that the steps to either side predict; about the pose itself without
 // any.
-inline PosePrior<2> neighbour_prior(const Pose<2>& before, const Pose<2>& here,
-                                    const Pose<2>& after, const MotionStep& to_here,
-                                    const MotionStep& to_after, const MotionStep& no_motion) {
+inline PosePrior neighbour_prior(const Pose<2>& before, const Pose<2>& here, const Pose<2>& after,
+                                 const MotionStep& to_here, const MotionStep& to_after,
+                                 const MotionStep& no_motion) {
   if (!to_here.known && !to_after.known) return {here, no_motion.information()};
   const Pose<2> from_before = before * to_here.increment;
   if (!to_after.known) return {from_before, to_here.information()};
@@ -107,24 +107,24 @@ inline PosePrior<2> neighbour_prior(const Pose<2>& before, const Pose<2>& here,
 // Registers scans one after another, each to the map of all others. `poses` (n + 2) has one more at
 // either end, `steps` (n + 1) lead to each scan and beyond the last; the poses of `scans` are
 // T_base_sensor.
-inline std::vector<ScanRegistrationResult<2>> refine_scans(OccupancyGrid<2>& grid,
-                                                           const Scans<2>& scans, const float* e,
-                                                           const bool* is_in_map,
-                                                           std::vector<Pose<2>> poses,
-                                                           const std::vector<MotionStep>& steps,
-                                                           const RefinementOptions& options) {
-  std::vector<ScanRegistrationResult<2>> out;
+inline std::vector<ScanRegistrationResult> refine_scans(OccupancyGrid<2>& grid,
+                                                        const Scans<2>& scans, const float* e,
+                                                        const bool* is_in_map,
+                                                        std::vector<Pose<2>> poses,
+                                                        const std::vector<MotionStep>& steps,
+                                                        const RefinementOptions& options) {
+  std::vector<ScanRegistrationResult> out;
   for (size_t t = 0; t < scans.n_scans; ++t) {
     const ScanBeams scan = beams_of(scans, e, t);
     Pose<2>& here = poses[t + 1];
     if (is_in_map[t]) add_hits(grid, scan, here, -1, options.interpolation);
-    WeightedBeams<2> beams = collect_hits(scan, options.normals);
-    const PosePrior<2> prior =
+    WeightedBeams beams = collect_hits(scan, options.normals);
+    const PosePrior prior =
         neighbour_prior(poses[t], here, poses[t + 2], steps[t], steps[t + 1], options.no_motion);
-    LikelihoodField<2> field(grid, options.registration.field);
-    auto found = minimise_levenberg_marquardt<2>(field, beams, prior, here, options.registration);
+    LikelihoodField field(grid, options.registration.field);
+    auto found = minimise_levenberg_marquardt(field, beams, prior, here, options.registration);
     found.information =
-        prior.information + surface_information<2>(field, beams, found.pose, options.registration);
+        prior.information + surface_information(field, beams, found.pose, options.registration);
     const double angle = std::atan2(found.pose.R(1, 0), found.pose.R(0, 0));
     found.pose.R = Eigen::Rotation2Dd(angle).toRotationMatrix();  // rounding errors add up
     here = found.pose;

@@ -18,18 +18,17 @@
 
 namespace stillmap {
 
-template <int D>
 struct WeightedBeams {
-  std::vector<Vec<D>> points;  // metres, moving frame
+  std::vector<Vec<2>> points;  // metres, moving frame
   std::vector<double> weights;
-  std::vector<SurfaceNormal<D>> normals;   // moving frame; empty: unknown
-  std::vector<GaussianWindow<D>> windows;  // cache, one per beam
-  std::vector<bool> beyond_map;            // see mark_beyond_map; empty: none is
+  std::vector<SurfaceNormal> normals;   // moving frame; empty: unknown
+  std::vector<GaussianWindow> windows;  // cache, one per beam
+  std::vector<bool> beyond_map;         // see mark_beyond_map; empty: none is
   // share of each beam that the map explains at a pose; of the last one that was evaluated
   std::vector<double> explained;
-  std::optional<Pose<D>> explained_at;
+  std::optional<Pose<2>> explained_at;
 
-  bool is_explained_at(const Pose<D>& pose) const {
+  bool is_explained_at(const Pose<2>& pose) const {
     return explained_at && explained_at->R == pose.R && explained_at->t == pose.t;
   }
 };
@@ -40,72 +39,58 @@ struct ScanRegistrationOptions {
   int max_iterations;
 };
 
-template <int D>
 struct PosePrior {
-  Pose<D> pose;
-  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information;
+  Pose<2> pose;
+  Eigen::Matrix3d information;
 };
 
-template <int D>
 struct ScanRegistrationResult {
-  Pose<D> pose;
+  Pose<2> pose;
   // of the posterior, by the normals of the surfaces where they are known
-  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information;
+  Eigen::Matrix3d information;
   double cost = 0.0;
   double inliers = 0.0;  // weighted share of beams that the map explains
   int iterations = 0;
 };
 
-template <int D>
 struct QuadraticModel {
-  typename Lie<D>::Tangent gradient = Lie<D>::Tangent::Zero();
-  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> hessian =
-      Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof>::Zero();
+  Lie<2>::Tangent gradient = Lie<2>::Tangent::Zero();
+  Eigen::Matrix3d hessian = Eigen::Matrix3d::Zero();
   double cost = 0.0;
   double inliers = 0.0;
 };
 
 // Projection of a symmetric matrix on to the positive semidefinite ones.
-template <int D>
-inline Eigen::Matrix<double, D, D> positive_part(const Eigen::Matrix<double, D, D>& A) {
-  if constexpr (D == 2) {
-    const double mean = 0.5 * (A(0, 0) + A(1, 1));
-    const double half = 0.5 * (A(0, 0) - A(1, 1));
-    const double half_gap = std::sqrt(half * half + A(0, 1) * A(0, 1));
-    const double low = mean - half_gap, high = mean + half_gap;
-    if (low >= 0.0) return A;
-    if (high <= 0.0) return Eigen::Matrix2d::Zero();
-    return (A - low * Eigen::Matrix2d::Identity()) * (high / (high - low));
-  } else {
-    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
-    eigen.computeDirect(A);
-    const Vec<D> eigenvalues = eigen.eigenvalues().cwiseMax(0.0);
-    return eigen.eigenvectors() * eigenvalues.asDiagonal() * eigen.eigenvectors().transpose();
-  }
+inline Eigen::Matrix2d positive_part(const Eigen::Matrix2d& A) {
+  const double mean = 0.5 * (A(0, 0) + A(1, 1));
+  const double half = 0.5 * (A(0, 0) - A(1, 1));
+  const double half_gap = std::sqrt(half * half + A(0, 1) * A(0, 1));
+  const double low = mean - half_gap, high = mean + half_gap;
+  if (low >= 0.0) return A;
+  if (high <= 0.0) return Eigen::Matrix2d::Zero();
+  return (A - low * Eigen::Matrix2d::Identity()) * (high / (high - low));
 }
 
 // Negative Hessian of ln F, projected on to the positive semidefinite matrices: sigma^-2 minus the
 // covariance of (mu_k - y) / sigma^2, so zero along a wall.
-template <int D>
-inline Eigen::Matrix<double, D, D> curvature(const FieldSample<D>& sample, double sigma) {
-  Eigen::Matrix<double, D, D> A = -sample.pull_covariance;
+inline Eigen::Matrix2d curvature(const FieldSample& sample, double sigma) {
+  Eigen::Matrix2d A = -sample.pull_covariance;
   A.diagonal().array() += 1.0 / (sigma * sigma);
-  return positive_part<D>(A);
+  return positive_part(A);
 }
 
-template <int D>
-inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& beams,
-                                   const Pose<D>& pose, const ScanRegistrationOptions& options) {
-  QuadraticModel<D> model;
+inline QuadraticModel linearise(LikelihoodField& field, WeightedBeams& beams, const Pose<2>& pose,
+                                const ScanRegistrationOptions& options) {
+  QuadraticModel model;
   beams.windows.resize(beams.points.size());
   beams.explained.assign(beams.points.size(), 0.0);
   beams.explained_at.reset();
   double total = 0.0;
   for (size_t n = 0; n < beams.points.size(); ++n) {
     const double weight = options.information_scale * beams.weights[n];
-    const Vec<D> lever = pose.R * beams.points[n];
-    const Vec<D> point = pose.t + lever;
-    const FieldSample<D> sample =
+    const Vec<2> lever = pose.R * beams.points[n];
+    const Vec<2> point = pose.t + lever;
+    const FieldSample sample =
         !beams.beyond_map.empty() && beams.beyond_map[n]
             ? field.evaluate_beyond_map(point, pose.R * beams.normals[n].normal, beams.windows[n])
             : field.evaluate(point, beams.windows[n]);
@@ -114,11 +99,11 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
     if (sample.value <= 0.0) continue;
     const double p_explained = sample.value / (sample.baseline + sample.value);
     beams.explained[n] = p_explained;
-    const auto J = Lie<D>::jacobian(lever);
+    const auto J = Lie<2>::jacobian(lever);
     model.inliers += beams.weights[n] * p_explained;
     model.gradient.noalias() -= weight * p_explained * (J.transpose() * sample.log_gradient);
     model.hessian.noalias() +=
-        weight * p_explained * (J.transpose() * curvature<D>(sample, options.field.sigma) * J);
+        weight * p_explained * (J.transpose() * curvature(sample, options.field.sigma) * J);
   }
   if (total > 0.0) model.inliers /= total;
   if (beams.beyond_map.empty()) beams.explained_at = pose;
@@ -126,29 +111,25 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
 }
 
 // Information of the beams about the pose by the normals of the surfaces that they see.
-template <int D>
-inline Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> surface_information(
-    LikelihoodField<D>& field, WeightedBeams<D>& beams, const Pose<D>& pose,
-    const ScanRegistrationOptions& options) {
-  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information =
-      Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof>::Zero();
+inline Eigen::Matrix3d surface_information(LikelihoodField& field, WeightedBeams& beams,
+                                           const Pose<2>& pose,
+                                           const ScanRegistrationOptions& options) {
+  Eigen::Matrix3d information = Eigen::Matrix3d::Zero();
   const double per_beam = options.information_scale / (options.field.sigma * options.field.sigma);
-  if (!beams.is_explained_at(pose)) linearise<D>(field, beams, pose, options);
+  if (!beams.is_explained_at(pose)) linearise(field, beams, pose, options);
   for (size_t n = 0; n < beams.points.size(); ++n) {
     const double p_explained = beams.explained[n];
     if (p_explained <= 0.0) continue;
-    const Vec<D> lever = pose.R * beams.points[n];
+    const Vec<2> lever = pose.R * beams.points[n];
     const auto& surface = beams.normals[n];
-    information.noalias() +=
-        per_beam * beams.weights[n] * p_explained *
-        endpoint_information<D>(lever, pose.R * surface.normal, surface.isotropy);
+    information.noalias() += per_beam * beams.weights[n] * p_explained *
+                             endpoint_information(lever, pose.R * surface.normal, surface.isotropy);
   }
   return information;
 }
 
 // Mean cosine of the bearings of the end points, weighted; 1 straight ahead.
-template <int D>
-inline double mean_bearing_cosine(const WeightedBeams<D>& beams) {
+inline double mean_bearing_cosine(const WeightedBeams& beams) {
   double total = 0.0, sum = 0.0;
   for (size_t n = 0; n < beams.points.size(); ++n) {
     const double range = beams.points[n].norm();
@@ -159,27 +140,23 @@ inline double mean_bearing_cosine(const WeightedBeams<D>& beams) {
   return total > 0.0 ? sum / total : 0.0;
 }
 
-// Marks the end points at `pose` that lie at the end of the mapped part of a flat surface. Only in
-// 2D, and for scans that look backwards: ahead of the robot, walls that end at unknown space fix
-// its position along them.
-template <int D>
-inline void mark_beyond_map(LikelihoodField<D>& field, WeightedBeams<D>& beams,
-                            const Pose<D>& pose) {
+// Marks the end points at `pose` that lie at the end of the mapped part of a flat surface, of
+// scans that look backwards: ahead of the robot, walls that end at unknown space fix its position
+// along them.
+inline void mark_beyond_map(LikelihoodField& field, WeightedBeams& beams, const Pose<2>& pose) {
   constexpr double kFlat = 0.5;       // isotropy, up to which a surface has a direction
   constexpr double kBackward = -0.2;  // mean cosine of the bearings of a backward scan, at most
   beams.beyond_map.clear();
-  if constexpr (D == 2) {
-    if (mean_bearing_cosine(beams) >= kBackward) return;
-    beams.windows.resize(beams.points.size());
-    beams.beyond_map.assign(beams.points.size(), false);
-    for (size_t n = 0; n < beams.normals.size(); ++n) {
-      const auto& surface = beams.normals[n];
-      if (surface.isotropy > kFlat || surface.normal.isZero(0.0)) continue;
-      const Vec<D> point = pose * beams.points[n], normal = pose.R * surface.normal;
-      const Vec<D> tangent(-normal[1], normal[0]);
-      beams.beyond_map[n] = field.is_end_of_mapped_surface(point, tangent, beams.windows[n]) ||
-                            field.is_end_of_mapped_surface(point, -tangent, beams.windows[n]);
-    }
+  if (mean_bearing_cosine(beams) >= kBackward) return;
+  beams.windows.resize(beams.points.size());
+  beams.beyond_map.assign(beams.points.size(), false);
+  for (size_t n = 0; n < beams.normals.size(); ++n) {
+    const auto& surface = beams.normals[n];
+    if (surface.isotropy > kFlat || surface.normal.isZero(0.0)) continue;
+    const Vec<2> point = pose * beams.points[n], normal = pose.R * surface.normal;
+    const Vec<2> tangent(-normal[1], normal[0]);
+    beams.beyond_map[n] = field.is_end_of_mapped_surface(point, tangent, beams.windows[n]) ||
+                          field.is_end_of_mapped_surface(point, -tangent, beams.windows[n]);
   }
 }
 
@@ -188,32 +165,32 @@ inline void mark_beyond_map(LikelihoodField<D>& field, WeightedBeams<D>& beams,
 // wall would be pulled to the end of the mapped one, and the robot with it. Cost, inliers and
 // information of the result are those of the unmodified field, so that results from several starts
 // compare.
-template <int D>
-inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
-    LikelihoodField<D>& field, WeightedBeams<D>& beams, const PosePrior<D>& prior,
-    const Pose<D>& start, const ScanRegistrationOptions& options) {
-  mark_beyond_map<D>(field, beams, start);
-  auto with_prior = [&](const Pose<D>& pose, double cost) {
-    const typename Lie<D>::Tangent difference = pose.boxminus(prior.pose);
+inline ScanRegistrationResult minimise_levenberg_marquardt(LikelihoodField& field,
+                                                           WeightedBeams& beams,
+                                                           const PosePrior& prior,
+                                                           const Pose<2>& start,
+                                                           const ScanRegistrationOptions& options) {
+  mark_beyond_map(field, beams, start);
+  auto with_prior = [&](const Pose<2>& pose, double cost) {
+    const Lie<2>::Tangent difference = pose.boxminus(prior.pose);
     return cost + 0.5 * difference.dot(prior.information * difference);
   };
-  ScanRegistrationResult<D> result;
+  ScanRegistrationResult result;
   result.pose = start;
-  QuadraticModel<D> model = linearise<D>(field, beams, start, options);
+  QuadraticModel model = linearise(field, beams, start, options);
   result.cost = with_prior(start, model.cost);
   double damping = 1e-3;
   for (; result.iterations < options.max_iterations; ++result.iterations) {
     auto H = (model.hessian + prior.information).eval();
     H.diagonal() *= 1.0 + damping;
-    const typename Lie<D>::Tangent gradient =
+    const Lie<2>::Tangent gradient =
         model.gradient + prior.information * result.pose.boxminus(prior.pose);
-    const typename Lie<D>::Tangent delta = -H.ldlt().solve(gradient);
+    const Lie<2>::Tangent delta = -H.ldlt().solve(gradient);
     if (!delta.allFinite()) break;
-    const Pose<D> trial = result.pose.boxplus(delta);
-    QuadraticModel<D> trial_model = linearise<D>(field, beams, trial, options);
+    const Pose<2> trial = result.pose.boxplus(delta);
+    QuadraticModel trial_model = linearise(field, beams, trial, options);
     const double cost = with_prior(trial, trial_model.cost);
-    const bool converged = delta.template head<D>().norm() < 2e-4 &&
-                           delta.template tail<Lie<D>::kRotation>().norm() < 5e-5;
+    const bool converged = delta.head<2>().norm() < 2e-4 && delta.tail<1>().norm() < 5e-5;
     if (cost <= result.cost) {
       result.pose = trial;
       result.cost = cost;
@@ -226,7 +203,7 @@ inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
   }
   if (!beams.beyond_map.empty()) {
     beams.beyond_map.clear();
-    model = linearise<D>(field, beams, result.pose, options);
+    model = linearise(field, beams, result.pose, options);
     result.cost = with_prior(result.pose, model.cost);
   }
   result.information = model.hessian + prior.information;

@@ -22,9 +22,8 @@ struct NormalOptions {
 };
 
 // Surface at one end point: its unit normal, and by how much it constrains the tangent too.
-template <int D>
 struct SurfaceNormal {
-  Vec<D> normal = Vec<D>::Zero();
+  Vec<2> normal = Vec<2>::Zero();
   double isotropy = 0.0;  // 0: a plane, 1: a point
 };
 
@@ -40,8 +39,8 @@ inline double squared_limit(double length) {
 
 // Normals of a planar scan from the neighbouring end points, in the order of the beams. An end
 // point with fewer than two neighbours may lie on a wall of any direction and has no normal.
-inline std::vector<SurfaceNormal<2>> estimate_normals(const std::vector<Vec<2>>& points,
-                                                      const NormalOptions& options) {
+inline std::vector<SurfaceNormal> estimate_normals(const std::vector<Vec<2>>& points,
+                                                   const NormalOptions& options) {
   const auto n_points = static_cast<int64_t>(points.size());
   const auto at = [&](int64_t n) -> const Vec<2>& { return points[static_cast<size_t>(n)]; };
   const double max_gap = squared_limit(options.max_gap), radius = squared_limit(options.radius);
@@ -63,7 +62,7 @@ inline std::vector<SurfaceNormal<2>> estimate_normals(const std::vector<Vec<2>>&
     }
     return last;
   };
-  std::vector<SurfaceNormal<2>> out(points.size());
+  std::vector<SurfaceNormal> out(points.size());
   for (int64_t n = 0; n < n_points; ++n) {
     auto& surface = out[static_cast<size_t>(n)];
     const int64_t first = extend(n, -1), last = extend(n, 1);
@@ -85,12 +84,10 @@ inline std::vector<SurfaceNormal<2>> estimate_normals(const std::vector<Vec<2>>&
 
 // Information of one end point about the pose, for a lever arm R p and a surface in the moving
 // frame; to be scaled by the inverse variance of the end point.
-template <int D>
-inline Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> endpoint_information(const Vec<D>& lever,
-                                                                              const Vec<D>& normal,
-                                                                              double isotropy) {
-  const auto J = Lie<D>::jacobian(lever);
-  Eigen::Matrix<double, D, D> constrained = (1.0 - isotropy) * normal * normal.transpose();
+inline Eigen::Matrix3d endpoint_information(const Vec<2>& lever, const Vec<2>& normal,
+                                            double isotropy) {
+  const auto J = Lie<2>::jacobian(lever);
+  Eigen::Matrix2d constrained = (1.0 - isotropy) * normal * normal.transpose();
   constrained.diagonal().array() += isotropy;
   return J.transpose() * constrained * J;
 }
