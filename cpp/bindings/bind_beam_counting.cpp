@@ -28,17 +28,15 @@ void ends(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit
   add_end_points<D>(grid, scans, weights, remove ? -1 : 1);
 }
 
-template <int D>
-void fill(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
-          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, double max_gap,
+void fill(OccupancyGrid<2>& grid, const Points<2>& points, const Flat<bool>& hit,
+          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<2>& poses, double max_gap,
           double tolerance, double max_gap_ratio, bool remove) {
-  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const auto scans = scans_from<2>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
   require(max_gap >= 0.0 && tolerance >= 0.0 && max_gap_ratio >= 0.0,
           "max_gap, tolerance, max_gap_ratio: expected numbers that are not negative");
   nb::gil_scoped_release released;
-  EndPointInterpolator<D>(grid, scans, weights, remove ? -1 : 1,
-                          {max_gap, tolerance, max_gap_ratio})
+  EndPointInterpolator(grid, scans, weights, remove ? -1 : 1, {max_gap, tolerance, max_gap_ratio})
       .add();
 }
 
@@ -105,14 +103,6 @@ void bind(nb::module_& m) {
         "Adds or removes the part of the sums of `add_beams` that depends on e (end cells of "
         "returns). Removing it with the old e and adding it with a new one updates the grid "
         "exactly.");
-  m.def("interpolate_end_points", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
-        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
-        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("max_gap"),
-        nb::arg("tolerance"), nb::arg("max_gap_ratio"), nb::arg("remove") = false,
-        "Interpolates end points, one per cell, between neighbouring end points at most `max_gap` "
-        "metres apart that are collinear with a third one within `tolerance` metres; the gap is at "
-        "most `max_gap_ratio` times that to the third one. They take the smaller e of the two and "
-        "add nothing to crossed cells. With remove it subtracts the same sums exactly.");
   m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid").none(), nb::arg("rest").none(),
         nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("stop_cells").noconvert(),
@@ -139,6 +129,14 @@ void bind(nb::module_& m) {
 void bind_beam_counting(nb::module_& m) {
   bind<2>(m);
   bind<3>(m);
+  m.def("interpolate_end_points", &fill, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("max_gap"),
+        nb::arg("tolerance"), nb::arg("max_gap_ratio"), nb::arg("remove") = false,
+        "Interpolates end points, one per cell, between neighbouring end points at most `max_gap` "
+        "metres apart that are collinear with a third one within `tolerance` metres; the gap is at "
+        "most `max_gap_ratio` times that to the third one. They take the smaller e of the two and "
+        "add nothing to crossed cells. With remove it subtracts the same sums exactly.");
 }
 
 }  // namespace stillmap::bindings

@@ -147,13 +147,10 @@ def test_any_order_of_scans_gives_the_same_bits(beams):
         )  # fmt: skip
     for a, b in zip(whole.dense(), piecewise.dense(), strict=True):
         assert (a == b).all()
-    points, weights = beams.points, beams.e  # the moments too
-    T = beams.T_map_sensor[-1]
-    costs = [
-        _core.registration_cost(grid, points, weights, T, 0.3, 2, 0.01, 0.1)
-        for grid in (whole, piecewise)
-    ]
-    assert costs[0] == costs[1]
+    if beams.dimension == 2:  # the moments too
+        probes = beams.points, beams.e, beams.T_map_sensor[-1], 0.3, 2, 0.01, 0.1
+        costs = [_core.registration_cost(grid, *probes) for grid in (whole, piecewise)]
+        assert costs[0] == costs[1]
 
 
 def test_five_rounds_of_em(beams):

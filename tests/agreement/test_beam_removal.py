@@ -32,11 +32,12 @@ def test_removal_is_exact(D, approach):
     _core.add_beams(grids[1], *other, remove=True)
     for a, b in zip(grids[0].dense(), grids[1].dense(), strict=True):
         np.testing.assert_array_equal(a, b)
-    points = one[0][one[1]]
-    weights = np.ones(len(points), np.float32)
-    options = {"sigma": 0.1, "radius": 2, "floor": 0.05, "unknown": 0.05}
-    costs = [_core.registration_cost(grid, points, weights, one[4][0], **options) for grid in grids]
-    assert costs[0] == costs[1]
+    if D == 2:
+        points = one[0][one[1]]
+        probes = points, np.ones(len(points), np.float32), one[4][0]
+        options = {"sigma": 0.1, "radius": 2, "floor": 0.05, "unknown": 0.05}
+        costs = [_core.registration_cost(grid, *probes, **options) for grid in grids]
+        assert costs[0] == costs[1]
 
 
 @pytest.mark.parametrize("D", [2, 3])

@@ -31,11 +31,11 @@ def interpolate_end_points(
 
     Args:
         grid: changed in place.
-        points: (M, D) metres, sensor frame.
+        points: (M, 2) metres, sensor frame.
         hit: (M,) bool.
         e: (M,) expectation of c, used where end points are added.
         offset: (T+1,).
-        T_map_sensor: (T, D+1, D+1).
+        T_map_sensor: (T, 3, 3).
         max_gap: metres, largest distance of two neighbours.
         tolerance: metres, largest distance of the third hit from their line.
         max_gap_ratio: largest ratio of the gap to that next to it.
@@ -48,7 +48,7 @@ def interpolate_end_points(
         if not value >= 0:
             raise ValueError(f"{name}: expected a number that is not negative, got {value}")
     expectation = per_beam(e, points)
-    hits = [b for b in usable_beams(grid.dimension, points, hit, offset, T_map_sensor) if b.hit]
+    hits = [b for b in usable_beams(2, points, hit, offset, T_map_sensor) if b.hit]
     for a, b, others in _neighbours(hits):
         if any(_is_collinear(a, b, other, max_gap, tolerance, max_gap_ratio) for other in others):
             both = expectation[[a.number, b.number]]

@@ -17,52 +17,49 @@ def smoothed_occupancy(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: 
 
     The sum over cells k within `radius` cells of that of y (largest coordinate difference) of
     m_k exp(-|y - mu_k|^2 / (2 sigma^2)), with mu_k the mean of the end points in cell k weighted
-    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1). In unobserved cells whose
-    neighbouring means lie on a line or plane, the surface is extrapolated: the mean of the m_k
+    with e, divided by sqrt(2 pi) sigma / resolution. In unobserved cells whose
+    neighbouring means lie on a line, the surface is extrapolated: the mean of the m_k
     times exp(-d^2 / (2 sigma^2)) at a distance d from it.
 
     Args:
         grid: the map.
-        y: (D,) metres, map frame.
+        y: (2,) metres, map frame.
         sigma: metres.
         radius: cells.
     """
     point = np.asarray(y, float)
     centre = cell_of(point, grid.resolution)
     means, m = _around(grid, centre, radius)
-    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= grid.dimension:
-        mean, normal, is_flat = _plane(means, m)
+    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= 2:
+        mean, normal, is_flat = _line(means, m)
         if is_flat:
             return float(m.mean() * exp(-((normal @ (mean - point)) ** 2) / (2 * sigma**2)))
     total = 0.0
     for mu, m_k in zip(means, m, strict=True):
         away = point - mu
         total += m_k * exp(-float(away @ away) / (2 * sigma**2))
-    return total / (sqrt(2 * pi) * sigma / grid.resolution) ** (grid.dimension - 1)
+    return total / (sqrt(2 * pi) * sigma / grid.resolution)
 
 
 def _around(grid: OccupancyGrid, centre: NDArray[np.int64], radius: int) -> tuple[Float, Float]:
-    """Means (K, D) of the end points in the neighbouring cells, and their occupancies (K,)."""
+    """Means (K, 2) of the end points in the neighbouring cells, and their occupancies (K,)."""
     means, m = [], []
-    for step in product(range(-radius, radius + 1), repeat=grid.dimension):
+    for step in product(range(-radius, radius + 1), repeat=2):
         cell = tuple((centre + step).tolist())
         alpha = grid.alpha.get(cell, 0.0)
         if alpha > 0:
             means.append(grid.moment[cell] / alpha)
             m.append(grid.occupancy_of(cell))
-    return np.array(means).reshape(-1, grid.dimension), np.array(m)
+    return np.array(means).reshape(-1, 2), np.array(m)
 
 
-def _plane(means: Float, m: Float) -> tuple[Float, Float, bool]:
-    """Centroid (D,) and normal (D,) of weighted points, and whether they are planar."""
+def _line(means: Float, m: Float) -> tuple[Float, Float, bool]:
+    """Centroid (2,) and normal (2,) of weighted points, and whether they lie on a line."""
     weights = m / m.sum()
     mean = weights @ means
     apart = means - mean
     variance, axes = np.linalg.eigh((weights[:, None] * apart).T @ apart)
-    is_flat = variance[0] < 0.1 * variance[1] and (
-        len(mean) == 2 or variance[1] > 0.1 * variance[2]
-    )
-    return mean, axes[:, 0], bool(is_flat)
+    return mean, axes[:, 0], bool(variance[0] < 0.1 * variance[1])
 
 
 def ends_of_surfaces(
@@ -129,21 +126,21 @@ def registration_cost(
 
     Args:
         grid: the map.
-        points: (N, D) metres, sensor frame.
+        points: (N, 2) metres, sensor frame.
         weights: (N,).
-        T: (D+1, D+1) T_map_sensor.
+        T: (3, 3) T_map_sensor.
         sigma: metres.
         radius: cells.
         floor: value of an end point in free space, where a wall has 1.
         unknown: added to floor in unobserved cells.
         ends: (N, 2) of `ends_of_surfaces`; None: no surface ends.
     """
-    pose, D = np.asarray(T, float), grid.dimension
+    pose = np.asarray(T, float)
     cost = 0.0
     beams = zip(np.asarray(points, float), np.asarray(weights, float), strict=True)
     for k, (p, w) in enumerate(beams):
         if np.isfinite(p).all():
-            y = pose[:D, :D] @ p + pose[:D, D]
+            y = pose[:2, :2] @ p + pose[:2, 2]
             if ends is not None and ends[k].any():
                 F = _field_at_end(grid, y, ends[k], sigma, radius)
             else:
@@ -172,14 +169,12 @@ def registration_gradient(
     """Gradient of `registration_cost` by central differences.
 
     Returns:
-        (3,) with respect to x, y, theta, or (6,) to x, y, z and a rotation vector: metres and
-        radians along the axes of the map, the sensor turning about its own position.
+        (3,) with respect to x, y, theta: metres and radians along the axes of the map, the sensor
+        turning about its own position.
     """
     pose = np.asarray(T, float)
     gradient = []
-    for i in range(3 if grid.dimension == 2 else 6):
-        delta = np.zeros(3 if grid.dimension == 2 else 6)
-        delta[i] = step
+    for delta in step * np.eye(3):
         above, below = (
             registration_cost(
                 grid, points, weights, retract(pose, d), sigma, radius, floor, unknown, ends
@@ -207,17 +202,16 @@ def registration_curvature(
     `_curvature`.
 
     Returns:
-        (3, 3) or (6, 6), order and units as the gradient's.
+        (3, 3), order and units as the gradient's.
     """
-    pose, D = np.asarray(T, float), grid.dimension
-    H = np.zeros((3, 3) if D == 2 else (6, 6))
+    pose = np.asarray(T, float)
+    H = np.zeros((3, 3))
     for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
         if np.isfinite(p).all():
-            y = pose[:D, :D] @ p + pose[:D, D]
+            y = pose[:2, :2] @ p + pose[:2, 2]
             F = smoothed_occupancy(grid, y, sigma, radius)
-            arm = y - pose[:D, D]
-            turning = [[-arm[1]], [arm[0]]] if D == 2 else np.cross(np.eye(3), arm).T
-            J = np.hstack([np.eye(D), turning])
+            arm = y - pose[:2, 2]
+            J = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]]])
             explained = F / (_base(grid, y, floor, unknown) + F)
             if F > 0:
                 H += w * explained * J.T @ _curvature(grid, y, sigma, radius) @ J
@@ -225,7 +219,7 @@ def registration_curvature(
 
 
 def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Float:
-    """(D, D) sigma^-2 I - sigma^-4 C / v without its negative part.
+    """(2, 2) sigma^-2 I - sigma^-4 C / v without its negative part.
 
     C is the spread of the means mu_k around y, each weighted with its part of F, and v the
     variance that is left to a Gaussian of variance 1 cut off where the sum ends. Where a
@@ -233,8 +227,8 @@ def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Floa
     """
     centre = cell_of(y, grid.resolution)
     means, m = _around(grid, centre, radius)
-    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= grid.dimension:
-        _, normal, is_flat = _plane(means, m)
+    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= 2:
+        _, normal, is_flat = _line(means, m)
         if is_flat:
             return np.outer(normal, normal) / sigma**2
     parts = m * np.exp(-((y - means) ** 2).sum(axis=1) / (2 * sigma**2))
@@ -242,21 +236,14 @@ def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Floa
     spread = (parts[:, None] * apart).T @ apart / parts.sum()
     cut = (radius + 0.5) * grid.resolution / sigma
     v = 1.0 - sqrt(2 / pi) * cut * exp(-(cut**2) / 2) / erf(cut / sqrt(2))
-    values, axes = np.linalg.eigh(np.eye(grid.dimension) / sigma**2 - spread / (v * sigma**4))
+    values, axes = np.linalg.eigh(np.eye(2) / sigma**2 - spread / (v * sigma**4))
     kept: Float = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
     return kept
 
 
 def retract(T: Float, delta: Float) -> Float:
-    """T_map_sensor shifted by delta[:D] and turned by delta[D:] about its own position."""
-    D = len(T) - 1
-    axis = np.array([0.0, 0.0, delta[2]]) if D == 2 else delta[3:]
-    angle = float(np.linalg.norm(axis))
-    out = T.copy()
-    out[:D, D] += delta[:D]
-    if angle > 0:
-        x, y, z = axis / angle
-        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)  # Rodrigues
-        out[:D, :D] = R[:D, :D] @ T[:D, :D]
+    """T_map_sensor (3, 3) shifted by delta[:2] and turned by delta[2] about its own position."""
+    out, turn = T.copy(), delta[2]
+    out[:2, 2] += delta[:2]
+    out[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] @ T[:2, :2]
     return out

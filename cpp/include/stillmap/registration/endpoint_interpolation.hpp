@@ -20,10 +20,9 @@ struct InterpolationOptions {
   double max_gap_ratio;  // of a gap to the gap next to it
 };
 
-template <int D>
 class EndPointInterpolator {
  public:
-  EndPointInterpolator(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
+  EndPointInterpolator(OccupancyGrid<2>& grid, const Scans<2>& scans, const float* e, Fixed sign,
                        const InterpolationOptions& options)
       : cursor_(grid),
         scans_(scans),
@@ -36,7 +35,7 @@ class EndPointInterpolator {
     for (size_t t = 0; t < scans_.n_scans; ++t) {
       first_ = scans_.offset[t];
       last_ = scans_.offset[t + 1] - 1;
-      pose_ = pose_from<D>(scans_.poses + t * (D + 1) * (D + 1));
+      pose_ = pose_from<2>(scans_.poses + t * 9);
       for (int64_t n = first_; n < last_; ++n)
         if (is_hit(n) && is_hit(n + 1) &&
             (is_collinear(n, n + 1, n - 1) || is_collinear(n + 1, n, n + 2)))
@@ -47,12 +46,12 @@ class EndPointInterpolator {
 
  private:
   bool is_hit(int64_t n) const { return n >= first_ && n <= last_ && scans_.hit[n]; }
-  Vec<D> point(int64_t n) const { return point_at<D>(scans_.points + n * D); }
+  Vec<2> point(int64_t n) const { return point_at<2>(scans_.points + n * 2); }
 
   // Whether the surface from `previous` to a continues straight to b.
   bool is_collinear(int64_t a, int64_t b, int64_t previous) const {
     if (!is_hit(previous)) return false;
-    const Vec<D> step = point(b) - point(a), previous_step = point(a) - point(previous);
+    const Vec<2> step = point(b) - point(a), previous_step = point(a) - point(previous);
     const double gap = step.norm(), previous_gap = previous_step.norm();
     if (gap > options_.max_gap || gap > options_.max_gap_ratio * previous_gap) return false;
     const double along = previous_step.dot(step) / (gap > 0.0 ? gap : 1.0);
@@ -60,32 +59,32 @@ class EndPointInterpolator {
     return along > 0.0 && off < options_.tolerance;
   }
 
-  void interpolate(const Vec<D>& from, const Vec<D>& to, double weight) {
-    for (const Vec<D>& end : {from, to})
-      if (!all_below<D>((pose_ * end) / resolution_, BlockLayout<D>::kMaxCell))
+  void interpolate(const Vec<2>& from, const Vec<2>& to, double weight) {
+    for (const Vec<2>& end : {from, to})
+      if (!all_below<2>((pose_ * end) / resolution_, BlockLayout<2>::kMaxCell))
         throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
     const auto n_steps = static_cast<int>(std::ceil((to - from).norm() / resolution_));
     for (int i = 1; i < n_steps; ++i) {
-      const Vec<D> point =
+      const Vec<2> point =
           (pose_ * (from + (to - from) * (static_cast<double>(i) / n_steps))) / resolution_;
-      const Cell<D> cell = cell_of<D>(point);
+      const Cell<2> cell = cell_of<2>(point);
       auto* block = cursor_.block(cell);
-      const auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
+      const auto local = static_cast<size_t>(BlockLayout<2>::local_of(cell));
       block->values[local].alpha += sign_ * to_fixed(weight);
-      auto& moment = OccupancyGrid<D>::moments_of(*block)[local];
-      for (int d = 0; d < D; ++d)
+      auto& moment = OccupancyGrid<2>::moments_of(*block)[local];
+      for (int d = 0; d < 2; ++d)
         moment[static_cast<size_t>(d)] += sign_ * to_fixed(weight * (point[d] - cell[d]));
     }
   }
 
-  BlockCursor<OccupancyGrid<D>> cursor_;
-  const Scans<D>& scans_;
+  BlockCursor<OccupancyGrid<2>> cursor_;
+  const Scans<2>& scans_;
   const float* e_;
   Fixed sign_;
   InterpolationOptions options_;
   double resolution_;
   int64_t first_ = 0, last_ = 0;
-  Pose<D> pose_;
+  Pose<2> pose_;
 };
 
 }  // namespace stillmap

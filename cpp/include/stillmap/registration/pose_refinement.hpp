@@ -72,7 +72,7 @@ inline void add_hits(OccupancyGrid<2>& grid, const ScanBeams& scan, const Pose<2
   const Scans<2> hits{points.data(), all_hit.get(), of_hits.data(), T.data(), 1};
   add_scans<2>(grid, hits, e.data(), sign, 0, 1);
   const Scans<2> all{scan.points, scan.hit, of_all.data(), T.data(), 1};
-  EndPointInterpolator<2>(grid, all, scan.e, sign, options).add();
+  EndPointInterpolator(grid, all, scan.e, sign, options).add();
 }
 
 // The hits of a scan with their normals, in the base frame.
