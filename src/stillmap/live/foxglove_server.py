@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.io.rigid_transforms import quaternion_from_pose
+from stillmap.io.rigid_transforms import embed_in_3d, quaternion_from_pose
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.movers import Mover
 from stillmap.live.scan import ScanBeams
@@ -158,20 +158,19 @@ def to_timestamp(ns: int) -> fox.Timestamp:
 
 def to_transforms(update: Update, stamp: fox.Timestamp) -> fox.FrameTransforms:
     """From the map to the odometry, and on to the robot; without odometry to the robot."""
-    pairs = [(MAP, BASE, update.pose)]
-    if update.T_map_odom is not None:
-        T_odom_base = se2.inverse(update.T_map_odom) @ update.pose
-        pairs = [(MAP, ODOM, update.T_map_odom), (ODOM, BASE, T_odom_base)]
+    pairs, T = [(MAP, BASE, _parts(update.pose))], update.T_map_odom
+    if T is not None:
+        pairs = [(MAP, ODOM, _parts(T)), (ODOM, BASE, _parts(se2.inverse(T) @ update.pose))]
     return fox.FrameTransforms(
         transforms=[
             fox.FrameTransform(
                 timestamp=stamp,
                 parent_frame_id=parent,
                 child_frame_id=child,
-                translation=_vector(T[:-1, -1]),
-                rotation=_rotation(T),
+                translation=position,
+                rotation=rotation,
             )
-            for parent, child, T in pairs
+            for parent, child, (position, rotation) in pairs
         ]
     )
 
@@ -201,9 +200,7 @@ def to_grid(grid: GridMap, stamp: fox.Timestamp) -> fox.Grid:
     return fox.Grid(
         timestamp=stamp,
         frame_id=MAP,
-        pose=fox.Pose(
-            position=_vector(np.array(grid.origin[:2])), orientation=fox.Quaternion(w=1.0)
-        ),
+        pose=_pose(se2.matrix(*grid.origin)),
         column_count=p.shape[1],
         cell_size=fox.Vector2(x=edge, y=edge),
         row_stride=5 * p.shape[1],
@@ -218,7 +215,7 @@ def to_path(positions: Float, stamp: fox.Timestamp) -> fox.SceneUpdate:
     points = _lift(positions, _PATH_HEIGHT)[:: max(1, -(-len(positions) // _MAX_PATH))]
     line = fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineStrip,
-        pose=fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0)),
+        pose=_pose(np.eye(4)),
         thickness=0.05,
         points=[fox.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
         color=_color(BLUE),
@@ -228,7 +225,7 @@ def to_path(positions: Float, stamp: fox.Timestamp) -> fox.SceneUpdate:
 
 
 def to_movers(movers: Sequence[Mover], stamp: fox.Timestamp) -> fox.SceneUpdate:
-    """A cylinder with its number for each mover, and an arrow as long as its way in a second.
+    """A cylinder for each mover, and an arrow as long as its way in a second.
 
     Those of before go: a message may be lost on the way.
     """
@@ -244,39 +241,29 @@ def to_log(doubts: tuple[str, ...], stamp: fox.Timestamp) -> fox.Log:
 
 
 def _mover(stamp: fox.Timestamp, mover: Mover) -> fox.SceneEntity:
-    x, y, z = _lift(mover.position[None], 0.5 * _MOVER_HEIGHT)[0].tolist()
-    speed = math.hypot(*mover.velocity)
+    width, speed = 2.0 * mover.radius, math.hypot(*mover.velocity)
+    upright = np.eye(4)
+    upright[:3, 3] = _lift(mover.position[None], 0.5 * _MOVER_HEIGHT)[0]
     heading = se2.matrix(0.0, 0.0, math.atan2(mover.velocity[1], mover.velocity[0]))
-    top, upright = fox.Vector3(x=x, y=y, z=z + 0.5 * _MOVER_HEIGHT), fox.Quaternion(w=1.0)
+    on_top = upright @ embed_in_3d(heading)
+    on_top[2, 3] += 0.5 * _MOVER_HEIGHT
     body = fox.CylinderPrimitive(
-        pose=fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=upright),
-        size=fox.Vector3(x=2.0 * mover.radius, y=2.0 * mover.radius, z=_MOVER_HEIGHT),
+        pose=_pose(upright),
+        size=fox.Vector3(x=width, y=width, z=_MOVER_HEIGHT),
         bottom_scale=1.0,
         top_scale=1.0,
         color=_color(ORANGE, 0.5),
     )
     arrow = fox.ArrowPrimitive(
-        pose=fox.Pose(position=top, orientation=_rotation(heading)),
+        pose=_pose(on_top),
         shaft_length=0.8 * speed,
         shaft_diameter=0.1,
         head_length=0.2 * speed,
         head_diameter=0.2,
         color=_color(ORANGE),
     )
-    label = fox.TextPrimitive(
-        pose=fox.Pose(position=top, orientation=upright),
-        billboard=True,
-        font_size=0.4,
-        color=_color(ORANGE),
-        text=str(mover.number),
-    )
     return fox.SceneEntity(
-        timestamp=stamp,
-        frame_id=MAP,
-        id=str(mover.number),
-        cylinders=[body],
-        arrows=[arrow],
-        texts=[label],
+        timestamp=stamp, frame_id=MAP, id=str(mover.number), cylinders=[body], arrows=[arrow]
     )
 
 
@@ -306,21 +293,16 @@ def _lift(points: NDArray[np.floating], z: float = 0.0) -> NDArray[np.floating]:
     return out
 
 
+def _parts(T: Float) -> tuple[fox.Vector3, fox.Quaternion]:
+    T = embed_in_3d(T)
+    x, y, z = T[:3, 3].tolist()
+    w, i, j, k = quaternion_from_pose(T).tolist()
+    return fox.Vector3(x=x, y=y, z=z), fox.Quaternion(x=i, y=j, z=k, w=w)
+
+
 def _pose(T: Float) -> fox.Pose:
-    return fox.Pose(position=_vector(T[:-1, -1]), orientation=_rotation(T))
-
-
-def _vector(values: Float) -> fox.Vector3:
-    x, y, z = (*values.tolist(), 0.0)[:3]
-    return fox.Vector3(x=x, y=y, z=z)
-
-
-def _rotation(T: Float) -> fox.Quaternion:
-    if len(T) == 3:
-        half = 0.5 * math.atan2(T[1, 0], T[0, 0])
-        return fox.Quaternion(z=math.sin(half), w=math.cos(half))
-    w, x, y, z = quaternion_from_pose(T).tolist()
-    return fox.Quaternion(x=x, y=y, z=z, w=w)
+    position, orientation = _parts(T)
+    return fox.Pose(position=position, orientation=orientation)
 
 
 def _color(rgb: Rgb, alpha: float = 1.0) -> fox.Color:

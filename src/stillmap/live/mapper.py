@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,11 +91,16 @@ class LiveMapper:
         self._known = None if place is None else KnownMap(place)
         if self._known is not None and mode == "extend":
             self.options = _adopt_resolution(self.options, self._known, 2)
-        self._in_background, self._max_scratch, self._lag = background, max_scratch, lag
-        self._folder = None if folder is None else Path(folder)
-        self._scratch = None if scratch is None else Path(scratch)
+        self._begin = partial(
+            OnlineSlam,
+            in_background=background,
+            folder=None if folder is None else Path(folder),
+            scratch=None if scratch is None else Path(scratch),
+            max_scratch=max_scratch,
+            lag=lag,
+        )
         self._mapping: OnlineSlam | None = None  # since the first scan
-        self._last_ns: int | None = None
+        self._last_ns = 0
         self._is_closed = False
 
     def push(self, scan: Scan | ScanBeams, odometry: ArrayLike | None = None) -> Update:
@@ -112,12 +118,11 @@ class LiveMapper:
         beams = self._to_usable_beams(scan)
         self._require_next(beams)
         T_odom_base = _to_matrix(odometry, beams.dimension)
-        if self._slam is None or self._last_ns is None:
-            self._mapping = self._begin(beams.dimension)
-        assert self._mapping is not None
-        update = self._mapping.push(beams, T_odom_base)
+        if self._mapping is None:
+            localizer = self._make_localizer(beams.dimension)  # which may change the options
+            self._mapping = self._begin(beams.dimension, self.options, localizer)
         self._last_ns = beams.stamp_ns
-        return update
+        return self._mapping.push(beams, T_odom_base)
 
     def update_map(self) -> None:
         """Add the last scan to the map and to what is kept.
@@ -258,22 +263,6 @@ class LiveMapper:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _begin(self, dimension: int) -> OnlineSlam:
-        """Begin mapping with the first scan, in its dimension."""
-        if self._mapping is not None:  # of a first scan that could not be mapped
-            self._mapping.close()
-        localizer = self._make_localizer(dimension)  # which may change the options
-        return OnlineSlam(
-            dimension,
-            self.options,
-            localizer,
-            in_background=self._in_background,
-            folder=self._folder,
-            scratch=self._scratch,
-            max_scratch=self._max_scratch,
-            lag=self._lag,
-        )
-
     def _make_localizer(self, dimension: int) -> Localizer | None:
         known, extends = self._known, self._mode == "extend"
         if self._source is None or known is None:
@@ -296,17 +285,18 @@ class LiveMapper:
     @property
     def _pushed(self) -> OnlineSlam:
         """The mapping that began with the first scan; an error before it."""
-        if self._slam is None or self._last_ns is None:
+        slam = self._slam
+        if slam is None:
             raise InputError("no scan was pushed yet")
-        return self._slam
+        return slam
 
     def _require_next(self, beams: ScanBeams) -> None:
         """Check a scan against those before."""
-        D = beams.dimension
-        if self._slam is None or self._last_ns is None:
+        slam, D = self._slam, beams.dimension
+        if slam is None:
             return
-        if self._slam.dimension != D:
-            raise ValueError(f"scan: expected {self._slam.dimension}D as before, got {D}D")
+        if slam.dimension != D:
+            raise ValueError(f"scan: expected {slam.dimension}D as before, got {D}D")
         if beams.stamp_ns < self._last_ns:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")

@@ -24,14 +24,7 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.live.history import FOLDER
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import Show
-from stillmap.live.ros.intake import (
-    BACKWARDS,
-    NO_MOUNT,
-    NO_ODOMETRY,
-    SET_BACK,
-    Arrival,
-    ScanIntake,
-)
+from stillmap.live.ros.intake import BACKWARDS, NO_MOUNT, NO_ODOMETRY, Arrival, ScanIntake
 from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import MapPublisher, Publishers
 from stillmap.live.ros.transforms import Transforms
@@ -259,7 +252,7 @@ class LiveNode:
         if new[BACKWARDS] or new[NO_MOUNT]:
             level = DiagnosticStatus.ERROR
         if self._intake.set_back:
-            text = f"clock set back by {self._intake.set_back:.0f} s: no scan is mapped; {text}"
+            text = f"clock set back by {self._intake.set_back:.0f} s: start the node anew; {text}"
         self._publishers.publish_status(level, text, values)
         self._warn(new)
 
@@ -270,9 +263,6 @@ class LiveNode:
             NO_MOUNT: f"base_frame is '{names.base_frame}'; TF: {frames}",
             NO_ODOMETRY: f"neither TF from '{names.odom_frame}' to '{names.base_frame}' nor "
             f"'{names.odom_topic}'; scans are mapped without",
-            BACKWARDS: "such scans are left out",
-            SET_BACK: f"by {self._intake.set_back:.0f} s: no scan is mapped until it has caught "
-            "up; to map on, start the node anew",
         }
         for reason in new:
             if self._intake.counts[reason] == new[reason]:  # for the first time

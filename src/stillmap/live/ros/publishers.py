@@ -1,6 +1,7 @@
 """Publishers of the node: pose, transform, movers, labelled scans, diagnostics and the map."""
 
 import array
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +13,6 @@ from geometry_msgs import msg as geometry
 from nav_msgs.msg import MapMetaData, OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from tf2_ros import TransformBroadcaster
@@ -20,6 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
+from stillmap.io.rigid_transforms import embed_in_3d, quaternion_from_pose
 from stillmap.io.ros.messages import stamp_ns
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
@@ -117,11 +118,13 @@ class Publishers:
         """The movers of a scan; markers of others are removed."""
         header = _to_header(self._parameters.map_frame, stamp)
         if self._mover_poses.get_subscription_count():
+            headings = [math.atan2(mover.velocity[1], mover.velocity[0]) for mover in movers]
             poses = [
                 geometry.Pose(
-                    position=_to_vector(mover.position), orientation=_to_heading(mover.velocity)
+                    position=_to_vector(mover.position),
+                    orientation=_to_rotation(se2.matrix(0.0, 0.0, heading)),
                 )
-                for mover in movers
+                for mover, heading in zip(movers, headings, strict=True)
             ]
             self._mover_poses.publish(geometry.PoseArray(header=header, poses=poses))
         if not self._markers.get_subscription_count():
@@ -153,7 +156,9 @@ class Publishers:
         ranges = np.asarray(arrival.message.ranges, np.float32)
         split = split_ranges(ranges, arrival.beams.hit, p_static)
         for publisher, of_label in zip(parts, split, strict=True):
-            publisher.publish(_copy_scan(arrival.message, of_label))
+            message = copy.copy(arrival.message)
+            message.ranges = _to_data(of_label.astype(np.float32), "f")
+            publisher.publish(message)
 
     def publish_status(self, level: bytes, text: str, values: dict[str, str]) -> None:
         """One line of diagnostics."""
@@ -237,16 +242,18 @@ class MapPublisher:
     def _take_over(self, changes: Sequence[MapChange]) -> tuple[slice, slice] | None:
         """Rows and columns of the rectangle around changed tiles, which are taken over; None: they
         are not all inside the map."""
-        low = np.array([change.first_cell for change in changes]) - self._first
-        high = low + np.array([change.p_occupied.shape[::-1] for change in changes])
-        if (low < 0).any() or (high > self._cells.shape[::-1]).any():
+        low = (np.array([change.first_cell for change in changes]) - self._first)[:, ::-1]
+        high = low + [change.p_occupied.shape for change in changes]
+        if (low < 0).any() or (high > self._cells.shape).any():
             return None
-        for (left, bottom), (right, top), change in zip(
-            low.tolist(), high.tolist(), changes, strict=True
-        ):
-            self._cells[bottom:top, left:right] = to_cells(change.p_occupied, self._mode)
-        (left, bottom), (right, top) = low.min(axis=0).tolist(), high.max(axis=0).tolist()
-        return slice(bottom, top), slice(left, right)
+        for begin, end, change in zip(low, high, changes, strict=True):
+            self._cells[_box(begin, end)] = to_cells(change.p_occupied, self._mode)
+        return _box(low.min(axis=0), high.max(axis=0))
+
+
+def _box(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, slice]:
+    (bottom, left), (top, right) = low.tolist(), high.tolist()
+    return slice(bottom, top), slice(left, right)
 
 
 def _to_markers(mover: Mover, header: Any) -> list[Any]:
@@ -297,17 +304,6 @@ def _to_cloud(arrival: Arrival, p_static: NDArray[np.float32], chosen: NDArray[n
     )
 
 
-def _copy_scan(scan: Any, ranges: NDArray[np.float32]) -> Any:
-    """A LaserScan as another one, with other ranges."""
-    names = ["angle_min", "angle_max", "angle_increment", "time_increment", "scan_time"]
-    names += ["range_min", "range_max", "intensities"]
-    return LaserScan(
-        header=_to_header(scan.header.frame_id, stamp_ns(scan.header)),
-        ranges=_to_data(ranges.astype(np.float32), "f"),
-        **{name: getattr(scan, name) for name in names},
-    )
-
-
 def _to_header(frame: str, stamp: int) -> Any:
     sec, nanosec = divmod(stamp, 10**9)
     return Header(frame_id=frame, stamp=Time(sec=sec, nanosec=nanosec))
@@ -325,15 +321,8 @@ def _to_vector(values: Sequence[float] | Float, kind: Any = geometry.Point) -> A
 
 def _to_rotation(T: Float) -> Any:
     """The rotation of a pose (D+1, D+1)."""
-    R = np.eye(3)
-    R[: len(T) - 1, : len(T) - 1] = T[:-1, :-1]
-    x, y, z, w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
+    w, x, y, z = quaternion_from_pose(embed_in_3d(T)).tolist()
     return geometry.Quaternion(x=x, y=y, z=z, w=w)
-
-
-def _to_heading(velocity: Float) -> Any:
-    half = 0.5 * math.atan2(velocity[1], velocity[0])
-    return geometry.Quaternion(z=math.sin(half), w=math.cos(half))
 
 
 def _to_data(values: NDArray[Any], code: str) -> "array.array[Any]":

@@ -71,17 +71,16 @@ class Transforms:
         names = self._parameters
         if not names.odom_frame:
             return None
+        T = None
         if self.source in (None, "TF"):
-            T = _look_up(self.buffer, names.odom_frame, names.base_frame, stamp)
-            if T is not None:
-                self.source = "TF"
-                return self._flatten(T)
-        if self.source in (None, names.odom_topic):
-            T = _look_up(self._messages, _MESSAGES, _ROBOT, stamp)
-            if T is not None:
-                self.source = names.odom_topic
-                return self._flatten(T @ self._child_to_base(stamp))
-        return None
+            T, source = _look_up(self.buffer, names.odom_frame, names.base_frame, stamp), "TF"
+        if T is None and self.source in (None, names.odom_topic):
+            T, source = _look_up(self._messages, _MESSAGES, _ROBOT, stamp), names.odom_topic
+            T = None if T is None else T @ self._child_to_base(stamp)
+        if T is None:
+            return None
+        self.source = source
+        return T if names.dimension == 3 else se2.project_to_plane(T[None])[0]
 
     @property
     def last_odometry_ns(self) -> int:
@@ -111,9 +110,6 @@ class Transforms:
         T[:3, :3] = Rotation.from_euler("xyz", values[3:]).as_matrix()  # about fixed axes
         T[:3, 3] = values[:3]
         return Mount(T)
-
-    def _flatten(self, T: Float) -> Float:
-        return T if self._parameters.dimension == 3 else se2.project_to_plane(T[None])[0]
 
     def _child_to_base(self, stamp: int) -> Float:
         """(4, 4) T_child_base, the base frame in the child frame of the messages; the identity if
