@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.grid_map import GridMap
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import CellProbabilities
@@ -19,7 +19,6 @@ _AZIMUTH = 0.006  # rad, of a pixel; lidars have finer steps than that
 _MIN_ELEVATION, _MAX_ELEVATION, _FACTOR = 0.005, 0.07, 1.15  # rad
 # share of the pixels between the lowest and the highest beam of their column that beams fill
 _FILLED = 0.8
-Float = NDArray[np.float64]
 OccupancyFilter = _core.OccupancyFilter2D | _core.SweepFilter3D
 
 # fewer classes than the E-step afterwards has: stationary probability, s of correlation
@@ -40,7 +39,7 @@ _RECENT_PRIOR = 0.05
 _TOLD_WITHIN_NS, _MIN_CHANGES = 10**9, 8
 
 
-def find_pixel_size(points: NDArray[np.float32], hit: NDArray[np.bool_]) -> tuple[float, float]:
+def find_pixel_size(points: Float32, hit: Bool) -> tuple[float, float]:
     """Azimuth and elevation (rad) of the smallest pixels that hardly any gaps lie between.
 
     Args:
@@ -58,7 +57,7 @@ def find_pixel_size(points: NDArray[np.float32], hit: NDArray[np.bool_]) -> tupl
     return _AZIMUTH, min(edge, _MAX_ELEVATION)
 
 
-def _filled_share(column: NDArray[np.int64], elevation: NDArray[np.float64], edge: float) -> float:
+def _filled_share(column: Int64, elevation: Float, edge: float) -> float:
     row = np.floor(elevation / edge).astype(np.int64)
     filled = len(np.unique(np.stack([column, row]), axis=1).T)
     order = np.argsort(column, kind="stable")
@@ -76,8 +75,8 @@ class MapChange(ShortRepr):
         p_occupied: (N, N) float32, in 3D (N, N, N), rows from the lowest y (z) on; NaN: unknown.
     """
 
-    first_cell: NDArray[np.int64]
-    p_occupied: NDArray[np.float32]
+    first_cell: Int64
+    p_occupied: Float32
 
 
 class CausalLabels:
@@ -139,22 +138,20 @@ class CausalLabels:
         """m, edge of a cell."""
         return float(self.filter.resolution)
 
-    def label(self, beams: ScanBeams, T_map_base: Float) -> NDArray[np.float32]:
+    def label(self, beams: ScanBeams, T_map_base: Float) -> Float32:
         """(N,) P(static) of the beams of a scan at a pose; NaN: unusable."""
         return self._label(beams.points, beams.hit, T_map_base @ beams.T_base_sensor, self._prior)
 
-    def label_ends(self, points: NDArray[np.float32], T_map_base: Float) -> NDArray[np.float32]:
+    def label_ends(self, points: Float32, T_map_base: Float) -> Float32:
         """(N,) P(static) of hits that end at points (N, D) in the base frame, with the prior of the
         map."""
         return self._label(points, np.ones(len(points), np.bool_), T_map_base, _MAP_PRIOR)
 
-    def _label(
-        self, points: NDArray[np.float32], hit: NDArray[np.bool_], T: Float, prior: float
-    ) -> NDArray[np.float32]:
+    def _label(self, points: Float32, hit: Bool, T: Float, prior: float) -> Float32:
         offset = np.array([0, len(points)])
         return self.filter.label(points, hit, offset, T[None], prior, threads=self._threads)
 
-    def doubt(self, e: NDArray[np.float32], *, of_ends: bool = False) -> NDArray[np.float32]:
+    def doubt(self, e: Float32, *, of_ends: bool = False) -> Float32:
         """(N,) P(static) of `label`, or of `label_ends`, with the prior of what was only just
         seen."""
         prior = _MAP_PRIOR if of_ends else self._prior

@@ -12,6 +12,7 @@ from foxglove.websocket import Capability, ServerListener
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.io.rigid_transforms import embed_in_3d, quaternion_from_pose
@@ -20,8 +21,6 @@ from stillmap.live.movers import Mover
 from stillmap.live.scan import ScanBeams
 from stillmap.live.update import DOUBTS, Update
 from stillmap.results.colors import BLUE, ORANGE, Rgb
-
-Float = NDArray[np.float64]
 
 HOST, PORT = "127.0.0.1", 8765
 MAP, ODOM, BASE = "map", "odom", "base"  # frames
@@ -268,11 +267,7 @@ def _mover(stamp: fox.Timestamp, mover: Mover) -> fox.SceneEntity:
 
 
 def _cloud(
-    stamp: fox.Timestamp,
-    T: Float,
-    points: NDArray[np.float32],
-    p_static: NDArray[np.float32],
-    color: Rgb,
+    stamp: fox.Timestamp, T: Float, points: Float32, p_static: Float32, color: Rgb
 ) -> fox.PointCloud:
     rows = np.zeros(len(points), _POINT)
     rows["position"], rows["p_static"], rows["color"] = _lift(points), p_static, (*color, 255)

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.short_repr import ShortRepr
-
-Float = NDArray[np.float64]
 
 # hits that labels call moving a second later: weight of a scan in their running share; share from
 # which people may walk along
@@ -32,7 +30,7 @@ _MAY_WALK = 0.04  # the first of them, from which people may walk along
 
 class _Kept(NamedTuple):
     stamp_ns: int
-    points: NDArray[np.float32]
+    points: Float32
     T_odom_base: Float
 
 
@@ -64,7 +62,7 @@ class Crowd:
         others are where odometry says."""
         return self._along > _MAY_WALK and self._both > _STATIC[0] * self._along
 
-    def learn(self, e: NDArray[np.float32]) -> None:
+    def learn(self, e: Float32) -> None:
         """Take the labels of an earlier scan.
 
         Args:
@@ -73,7 +71,7 @@ class Crowd:
         if len(e):
             self._moving += _LABEL_RATE * (float((e < 0.5).mean()) - self._moving)
 
-    def observe(self, points: NDArray[np.float32], increment: Float | None, stamp_ns: int) -> None:
+    def observe(self, points: Float32, increment: Float | None, stamp_ns: int) -> None:
         """Compare a scan with one that was taken a little before.
 
         Hits on people who walk along are where they were beside the robot, those on what stands
@@ -106,7 +104,7 @@ class Crowd:
                 return kept if metres <= _MAX_BASELINE else None
         return None
 
-    def _compare(self, points: NDArray[np.float32], earlier: _Kept) -> None:
+    def _compare(self, points: Float32, earlier: _Kept) -> None:
         tree = self._make_tree(earlier.points, balanced_tree=False, compact_nodes=False)
         thin = points[:: -(-len(points) // _MAX_HITS)].astype(np.float64)
         T = se2.inverse(earlier.T_odom_base) @ self._T_odom_base

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.local_frame import LocalFrame
@@ -22,8 +22,6 @@ from stillmap.places.surface_map import CONFLICT_WEIGHT, SurfaceMap, compare_sur
 from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.scan_hits import Scan
-
-Float = NDArray[np.float64]
 
 _MIN_SURFACE = 40  # squares of surface that a view needs
 # share of the surfaces of the view that the map shows, others may be people or new; and where the

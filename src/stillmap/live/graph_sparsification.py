@@ -4,17 +4,13 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.array_types import Index
+from stillmap.core.array_types import Bool, Float, Index, Int64
 from stillmap.slam.loop_candidates import MIN_LOOP_TRAVEL
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.loop_verification import CLOSURE_ROTATION, CLOSURE_TRANSLATION, SUBMAP_TRAVEL
 from stillmap.slam.types import LoopClosure, LoopContext
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _LATEST = 4  # stretches of other passes that stay at a place, the latest, besides the first
 _PLACE_DISTANCE, _PLACE_ANGLE = 1.5, 0.8  # m and rad between keyframes that show one place
@@ -32,7 +28,7 @@ class AnchoredPoses:
         self._anchor = np.zeros(0, np.int64)  # number of the scan with which each of them moves
         self._relative = np.zeros((0, 3))  # x, y, heading in its frame
 
-    def remove(self, stay: Mask, poses: Float) -> None:
+    def remove(self, stay: Bool, poses: Float) -> None:
         """Take scans out of the graph, which from now on move with the nearest one that stays.
 
         Args:
@@ -59,13 +55,13 @@ class AnchoredPoses:
         every[self._left] = every[self._anchor] @ se2.matrix(*self._relative.T)
         return every
 
-    def _extend_to(self, count: int) -> NDArray[np.int64]:
+    def _extend_to(self, count: int) -> Int64:
         """(K,) numbers of the scans in the graph, with those that were added since."""
         known = len(self._graph) + len(self._left)
         return np.append(self._graph, known + np.arange(count - len(self._graph)))
 
 
-def select_scans(context: LoopContext, state: LoopState) -> Mask:
+def select_scans(context: LoopContext, state: LoopState) -> Bool:
     """(S,) the spaced scans that stay.
 
     Stretches of `SUBMAP_TRAVEL` stay or leave whole: a submap needs all scans of one. Those stay
@@ -84,7 +80,7 @@ def select_scans(context: LoopContext, state: LoopState) -> Mask:
     stay = _find_first(of, near) | _find_indispensable(travelled, of, keyframes, state.fitting)
     stay |= _find_latest(of, near, stay)
     is_recent = context.travelled > context.travelled[-1] - _RECENT
-    out: Mask = is_recent | np.isin(stretch, of[stay])
+    out: Bool = is_recent | np.isin(stretch, of[stay])
     return out & ~_find_standing(context.poses, keyframes)
 
 
@@ -104,7 +100,7 @@ def _iter_distances(poses: Float, among: Float) -> Iterator[tuple[Float, Float]]
         yield away, np.abs(se2.wrap(rows[..., 2] - known[:, 2]))
 
 
-def _find_first(of: Index, near: Sequence[Index]) -> Mask:
+def _find_first(of: Index, near: Sequence[Index]) -> Bool:
     """(K,) keyframes of stretches in which a place was seen for the first time."""
     stay = np.zeros(len(of), np.bool_)
     for stretch in np.unique(of):
@@ -114,7 +110,7 @@ def _find_first(of: Index, near: Sequence[Index]) -> Mask:
     return stay
 
 
-def _find_latest(of: Index, near: Sequence[Index], stay: Mask) -> Mask:
+def _find_latest(of: Index, near: Sequence[Index], stay: Bool) -> Bool:
     """(K,) keyframes of the latest stretches at each place; `stay`: those that stay anyhow."""
     latest = np.zeros(len(of), np.bool_)
     for stretch in np.unique(of)[::-1]:
@@ -127,7 +123,7 @@ def _find_latest(of: Index, near: Sequence[Index], stay: Mask) -> Mask:
 
 def _find_indispensable(
     travelled: Float, of: Index, keyframes: Index, fitting: Sequence[LoopClosure]
-) -> Mask:
+) -> Bool:
     """(K,) keyframes of recent stretches, of those to which they are tied, and of those that no
     loop ties to others."""
     ends = [(closure.earlier, closure.later) for closure in fitting]
@@ -137,7 +133,7 @@ def _find_indispensable(
     return np.asarray(recent | np.isin(of, of_recent) | ~np.isin(of, of[at]))
 
 
-def _find_standing(poses: Float, keyframes: Index) -> Mask:
+def _find_standing(poses: Float, keyframes: Index) -> Bool:
     """(S,) scans from about where the scan before was taken, which are no keyframes."""
     x = se2.parameters(poses)
     step = np.hypot(*np.diff(x[:, :2], axis=0).T) + np.abs(se2.wrap(np.diff(x[:, 2])))
@@ -152,7 +148,7 @@ def find_nearest(poses: Float, among: Float) -> Index:
     return np.concatenate([np.zeros(0, np.intp), *rows])
 
 
-def select_state(state: LoopState, keyframes: Index, stay: Mask) -> LoopState:
+def select_state(state: LoopState, keyframes: Index, stay: Bool) -> LoopState:
     """The loops between the scans that stay, with their new numbers.
 
     A loop to an earlier keyframe that leaves becomes one to the nearest that stays.

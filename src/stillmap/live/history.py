@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import GrowingArray
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.recording import Recording
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.io.stillmap_folder import FORMAT, HEADER
 from stillmap.live.scan import ScanBeams
-
-Float = NDArray[np.float64]
 
 FOLDER = "recording"  # of a drive, in its result folder
 
@@ -82,11 +81,7 @@ class GrowingRecording:
         return self._count
 
     def append(
-        self,
-        beams: ScanBeams,
-        label: NDArray[np.float32],
-        T_odom_base: Float | None = None,
-        **notes: Any,
+        self, beams: ScanBeams, label: Float32, T_odom_base: Float | None = None, **notes: Any
     ) -> None:
         """Append a scan.
 
@@ -187,7 +182,7 @@ class GrowingRecording:
         """(T,) notes of the scans so far."""
         return self._arrays["notes"].view()
 
-    def labels(self) -> NDArray[np.float32]:
+    def labels(self) -> Float32:
         """(M,) labels of their beams."""
         return self._arrays["label"].view()
 
@@ -241,11 +236,7 @@ class History(GrowingRecording):
             raise cannot_write(error, folder or scratch or "") from error
 
     def append(
-        self,
-        beams: ScanBeams,
-        label: NDArray[np.float32],
-        T_odom_base: Float | None = None,
-        **notes: Any,
+        self, beams: ScanBeams, label: Float32, T_odom_base: Float | None = None, **notes: Any
     ) -> None:
         """Append a scan; once it is full, only count it."""
         if self._is_full:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.array_folder import open_npy
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
@@ -22,10 +23,7 @@ from stillmap.places.evidence import cell_keys
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.slam import lidar_odometry
 
-Float = NDArray[np.float64]
-
 _STATIC = 0.5  # P(static) of the points that are added: over hours others would fill the cells
-Index = NDArray[np.int64]
 
 # m from the origin of the local frame: squares and cubes of all cells are numbered in 64 bits
 _MAX_EXTENT = 5e4
@@ -51,9 +49,7 @@ class KnownPlanes:
         # poses of the base when sweeps were added, one in each cube: they grow with the area
         self._route = dict[tuple[int, ...], Float]()
 
-    def add(
-        self, points: NDArray[np.float32], weights: NDArray[np.float32], T_map_base: Float
-    ) -> None:
+    def add(self, points: Float32, weights: Float32, T_map_base: Float) -> None:
         """Add points (N, 3) in the base frame with weights P(static), if the map is extended."""
         if self._extends:
             static = weights >= _STATIC
@@ -104,9 +100,7 @@ class KnownCloud:
         local.add(self.points, self.p_static, np.eye(4))
         return local
 
-    def find_voxels(
-        self, edge: float, band: tuple[float, float]
-    ) -> tuple[Index, NDArray[np.bool_]]:
+    def find_voxels(self, edge: float, band: tuple[float, float]) -> tuple[Int64, Bool]:
         """(K, 3) voxels with which the labels are initialized, and (K,) whether surface runs there;
         else they are free.
 
@@ -119,11 +113,7 @@ class KnownCloud:
         return np.ascontiguousarray(cells), np.arange(len(cells)) < len(surface)
 
     def keep(
-        self,
-        now: CellProbabilities | None,
-        p_unseen: float,
-        edge: float,
-        band: tuple[float, float],
+        self, now: CellProbabilities | None, p_unseen: float, edge: float, band: tuple[float, float]
     ) -> KeptMap:
         """The points that are still occupied.
 
@@ -154,7 +144,7 @@ class KnownCloud:
         )
         return KeptMap(replace(grid, p_occupied=p_occupied), hits, cloud)
 
-    def _columns(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def _columns(self, points: Float32) -> Bool:
         """(H, W) cells of the planar map in which points (N, 3) lie."""
         out = np.zeros(self.planar.grid.p_occupied.shape, np.bool_)
         at = self.planar.grid.cells(points[:, :2].astype(np.float64))
@@ -162,7 +152,7 @@ class KnownCloud:
         out[row, column] = True
         return out
 
-    def _free_voxels(self, edge: float, band: tuple[float, float]) -> Index:
+    def _free_voxels(self, edge: float, band: tuple[float, float]) -> Int64:
         """(K, 3) voxels that lie in the band of columns which are free."""
         grid = self.planar.grid
         columns = _cells_of(grid.centres(np.argwhere(grid.free)), edge)
@@ -188,16 +178,14 @@ def thin_route(poses: Float) -> Float:
     return poses[np.sort(first)]
 
 
-def _find_standing(
-    points: NDArray[np.float32], now: CellProbabilities, p_unseen: float, edge: float
-) -> NDArray[np.bool_]:
+def _find_standing(points: Float32, now: CellProbabilities, p_unseen: float, edge: float) -> Bool:
     """(N,) which points (N, 3) lie in voxels that are still occupied."""
     cells, of = unique_cells(np.floor(points / edge).astype(np.int64))
     shared = _share_evidence(cells, _look_up(now, cells), p_unseen).astype(np.float32)
     return np.asarray(shared[of] >= STANDS)
 
 
-def _share_evidence(cells: Index, p_occupied: Float, p_unseen: float) -> Float:
+def _share_evidence(cells: Int64, p_occupied: Float, p_unseen: float) -> Float:
     """(N,) probabilities of voxels (N, 3) in lexicographic order after what this run saw of those
     around them, too: voxels of one thing leave together, and rings of a sweep miss many of them."""
     logit = _logit(p_occupied)
@@ -211,7 +199,7 @@ def _logit(p: Float) -> Float:
     return np.asarray(np.log(within / (1.0 - within)))
 
 
-def _sum_around(cells: Index, values: Float) -> Float:
+def _sum_around(cells: Int64, values: Float) -> Float:
     """(N,) sums of the values (N,) of cells (N, 3) in lexicographic order over the 3 x 3 x 3 cells
     around each."""
     keys, sums = cell_keys(cells), np.append(0.0, np.cumsum(values))
@@ -222,7 +210,7 @@ def _sum_around(cells: Index, values: Float) -> Float:
     return out
 
 
-def _look_up(now: CellProbabilities, cells: Index) -> Float:
+def _look_up(now: CellProbabilities, cells: Int64) -> Float:
     """(N,) probabilities of cells (N, 3); 1: nothing is known of it."""
     keys = cell_keys(now.cells)
     order = np.argsort(keys)
@@ -247,9 +235,7 @@ def _read_route(folder: Path) -> Float:
     return np.concatenate(poses)
 
 
-def _read_points(
-    folder: Path, frame: LocalFrame
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _read_points(folder: Path, frame: LocalFrame) -> tuple[Float32, Float32]:
     """(N, 3) the mean of the points in every voxel, in a frame, and (N,) their mean P(static)."""
     parts = [(np.zeros((0, 3), np.int64), np.zeros((0, 5)))]
     for block in cloud_from_folder(folder, "static").iter_blocks():
@@ -267,13 +253,13 @@ def _read_points(
     return np.ascontiguousarray(means[:, :3]), np.ascontiguousarray(means[:, 3])
 
 
-def _sum_up(keys: Index, values: Float) -> tuple[Index, Float]:
+def _sum_up(keys: Int64, values: Float) -> tuple[Int64, Float]:
     """Cells (N, D), each once, and the sums of their values (N, K)."""
     cells, of = unique_cells(keys)
     sums = [np.bincount(of, column, len(cells)) for column in values.T]
     return cells, np.stack(sums, axis=1)
 
 
-def _cells_of(points: NDArray[np.floating], edge: float) -> Index:
+def _cells_of(points: NDArray[np.floating], edge: float) -> Int64:
     """(K, D) the cells of points (N, D), each once."""
     return unique_cells(np.floor(points / edge).astype(np.int64))[0]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
@@ -30,8 +31,6 @@ from stillmap.results.point_cloud import Block, cloud_from_folder
 from stillmap.results.points import append_vertices
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, RECORD, Grid, read_run
 from stillmap.slam import scan_hits
-
-Float = NDArray[np.float64]
 
 ROUTE = "live/known_route.npy"  # of a result that extends a map, from where that one was made
 Layer = NDArray[np.floating]
@@ -52,9 +51,9 @@ class KeptCloud(ShortRepr):
     """
 
     points: Float
-    p_static: NDArray[np.float32]
+    p_static: Float32
     route: Float
-    stands: NDArray[np.bool_]
+    stands: Bool
 
 
 def write_extended_cloud(folder: Path, kept: KeptCloud, edge: float) -> None:
@@ -69,7 +68,7 @@ def write_extended_cloud(folder: Path, kept: KeptCloud, edge: float) -> None:
     seen = cloud_from_folder(folder, "static")
     first = np.floor(seen.origin / edge).astype(np.int64)
 
-    def keys(points: Float) -> NDArray[np.int64]:
+    def keys(points: Float) -> Int64:
         return cell_keys(np.floor(points / edge).astype(np.int64) - first)
 
     own = np.zeros(0, np.int64)

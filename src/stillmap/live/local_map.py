@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.core.array_types import Index
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.history import GrowingRecording
 from stillmap.live.scan import ScanBeams, take_beams
@@ -18,8 +17,6 @@ from stillmap.slam import loop_closure, loop_closure_3d, scan_hits
 from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopContext
-
-Float = NDArray[np.float64]
 
 _LABELLED_AFTER_NS = 10**9  # after which scans are labelled again
 _MAX_TRAVEL = 25.0  # m after which scans leave
@@ -38,7 +35,7 @@ class MappedScan(ShortRepr):
     """
 
     beams: ScanBeams
-    e: NDArray[np.float32]
+    e: Float32
     T_map_base: Float
     travelled: float
 
@@ -49,7 +46,7 @@ def thin_scan(scan: MappedScan, max_beams: int) -> MappedScan:
     return replace(scan, beams=take_beams(scan.beams, every), e=scan.e[every].copy())
 
 
-Labeller = Callable[[MappedScan], NDArray[np.float32]]  # P(static) (N,) of a scan
+Labeller = Callable[[MappedScan], Float32]  # P(static) (N,) of a scan
 
 
 class LocalMap:
@@ -70,7 +67,7 @@ class LocalMap:
         for scan in scans:
             self._insert(scan)
 
-    def join(self, later: "LocalMap", T: NDArray[np.float64]) -> None:
+    def join(self, later: "LocalMap", T: Float) -> None:
         """Add the scans of another map, which were taken later, moved by T (3, 3)."""
         self.extend(replace(scan, T_map_base=T @ scan.T_map_base) for scan in later._scans)
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.graph_sparsification import AnchoredPoses, select_scans, select_state
 from stillmap.live.local_map import MappedScan, SpacedScans
@@ -14,8 +14,6 @@ from stillmap.slam import local_map, loop_candidates, loop_closure
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopContext
-
-Float = NDArray[np.float64]
 
 _EVERY = 2.0  # m of travel between two searches for loops
 _NEAR_TRAVEL = 25.0  # m of drift up to which earlier scans are part of the local map

@@ -19,16 +19,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stillmap.core.array_types import Float
 from stillmap.core.parallel import trim_heap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction, LoopCloser
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.slam.options import SlamOptions
-
-Float = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 

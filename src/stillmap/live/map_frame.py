@@ -4,10 +4,10 @@ import logging
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.parallel import trim_heap
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.front_end import Registration
@@ -19,8 +19,6 @@ from stillmap.live.scan_odometry import ScanOdometry
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.live.sweep_odometry import SweepOdometry
 from stillmap.slam import local_map
-
-Float = NDArray[np.float64]
 
 # blocks of cells in 2D and 3D, scans of the local map: about 2 ms each, in 3D 15 ms
 _BLOCKS_PER_STEP, _SCANS_PER_STEP = {2: 24, 3: 500}, 2
@@ -57,7 +55,7 @@ class MapCorrection:
         labels: CausalLabels,
         spaced: Float,
         poses: Float,
-        tagged: NDArray[np.int64],
+        tagged: Int64,
     ) -> None:
         self.T_map_local, self.untied = correction.T_map_local, correction.untied
         self.count = len(correction.poses)  # of the spaced scans that were known
@@ -286,7 +284,7 @@ class MapFrame:
         moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
         return np.asarray(moved @ local)
 
-    def to_map_all(self, local: Float, anchor: NDArray[np.int64], is_whole: bool = True) -> Float:
+    def to_map_all(self, local: Float, anchor: Int64, is_whole: bool = True) -> Float:
         """(T, D+1, D+1) the same of all scans, or of the first ones; between spaced ones
         corrections are blended."""
         count = self._count if is_whole else min(self._count, int(anchor[-1:].sum()) + 1)

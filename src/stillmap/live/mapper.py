@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
@@ -34,7 +35,6 @@ from stillmap.prepare.plausibility import mapped_range, shorten_far_beams
 from stillmap.results.result import Result, to_options
 from stillmap.tracking import MovingObject
 
-Float = NDArray[np.float64]
 Mode = Literal["localise", "extend"]
 
 _MIN_SCRATCH = 100_000  # bytes: some scans at least
@@ -133,7 +133,7 @@ class LiveMapper:
         if self._mapping is not None:
             self._mapping.update_map()
 
-    def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
+    def label(self, scan: Scan | ScanBeams, number: int) -> Float32:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
 
         Args:

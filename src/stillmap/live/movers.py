@@ -3,17 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import kalman
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.arrays import unique_cells
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import adjacent_pairs, component_labels
 from stillmap.live.scan import ScanBeams
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _MAX_POINTS = 1200  # of a scan: every k-th of more
 _LINK = 0.35  # m between neighbours of one cluster in a planar scan
@@ -73,7 +69,7 @@ class MoverTracker:
         self._states = kalman.initialize(np.zeros((0, dimension)), _POSITION_STD)
         self._tracks = _Tracks.begin(np.zeros((0, dimension)), np.zeros(0), 0, 0)
 
-    def add(self, beams: ScanBeams, T: Float, p_static: NDArray[np.float32]) -> None:
+    def add(self, beams: ScanBeams, T: Float, p_static: Float32) -> None:
         """Update the tracks with a scan.
 
         Args:
@@ -182,7 +178,7 @@ class MoverTracker:
         """Lengths of differences (..., D)."""
         return np.asarray(np.sqrt(np.square(difference) @ np.square(self._weights)))
 
-    def _keep(self, kept: Mask) -> None:
+    def _keep(self, kept: Bool) -> None:
         if not kept.all():
             self._states, self._tracks = self._states.select(kept), self._tracks.select(kept)
 
@@ -194,10 +190,10 @@ class _Tracks:
     number: Index
     origin: Float
     radius: Float
-    begin_ns: NDArray[np.int64]
-    seen_ns: NDArray[np.int64]
+    begin_ns: Int64
+    seen_ns: Int64
     scans: Index
-    is_mover: Mask
+    is_mover: Bool
 
     @classmethod
     def begin(cls, center: Float, radius: Float, number: int, now_ns: int) -> "_Tracks":
@@ -206,7 +202,7 @@ class _Tracks:
         ones, no = np.ones(n, np.intp), np.zeros(n, np.bool_)
         return cls(number + np.arange(n), center.copy(), radius, now, now.copy(), ones, no)
 
-    def select(self, kept: Mask) -> "_Tracks":
+    def select(self, kept: Bool) -> "_Tracks":
         return _Tracks(*(column[kept] for column in vars(self).values()))
 
     def append(self, further: "_Tracks") -> "_Tracks":
@@ -214,9 +210,7 @@ class _Tracks:
         return _Tracks(*(np.concatenate(pair) for pair in columns))
 
 
-def _find_clusters(
-    beams: ScanBeams, T_sensor: Float, p_static: NDArray[np.float32]
-) -> tuple[Float, Index]:
+def _find_clusters(beams: ScanBeams, T_sensor: Float, p_static: Float32) -> tuple[Float, Index]:
     """Dynamic end points (n, D), in 3D one per cell, and the cluster (n,) of each.
 
     Clusters amid static end points are left out: parts of walls whose cells are not known well.
@@ -242,7 +236,7 @@ def _thin(chosen: Index) -> tuple[Index, int]:
     return chosen[::k], k
 
 
-def _transform(points: NDArray[np.float32], T: Float) -> Float:
+def _transform(points: Float32, T: Float) -> Float:
     """(n, D) points moved by a pose (D+1, D+1)."""
     return np.asarray(points @ T[:-1, :-1].T + T[:-1, -1])
 
@@ -271,7 +265,7 @@ def _to_covariances(P: Float, dimension: int) -> Float:
     return out.reshape(len(P), 2 * dimension, 2 * dimension)
 
 
-def _measure(points: Float, of: Index, n: int, sensor: Float) -> tuple[Mask, Float, Float]:
+def _measure(points: Float, of: Index, n: int, sensor: Float) -> tuple[Bool, Float, Float]:
     """A mask of the n groups that have points, their means (n, D), and half their widths (n,)
     across the view from the sensor, horizontally."""
     member = of == np.arange(n)[:, None]

@@ -7,10 +7,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.slam import motion_model, relocalization
 from stillmap.slam.motion_model import MotionPrior, gaussian_prior
 from stillmap.slam.odometry_faults import SlipDetector
@@ -26,8 +26,6 @@ from stillmap.slam.scan_matching import (
     refine_pose,
     search_pose,
 )
-
-Float = NDArray[np.float64]
 
 _SPACING_NS = 10**8  # between scans that are compared
 _STD = 0.005, 0.003  # m and rad by which both hypotheses may differ from the poses they predict

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels
@@ -28,8 +28,6 @@ from stillmap.live.sweep_odometry import SweepOdometry
 from stillmap.live.update import LaterLabels, Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam.scan_hits import Scan as PlanarHits
-
-Float = NDArray[np.float64]
 
 _SEARCH_DISTANCE = 0.5  # m between the sweeps with which a robot is searched in a known map
 
@@ -146,7 +144,7 @@ class OnlineSlam:
         if work is not None:
             work()
 
-    def label(self, beams: ScanBeams, number: int) -> NDArray[np.float32]:
+    def label(self, beams: ScanBeams, number: int) -> Float32:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
 
         Args:
@@ -158,7 +156,7 @@ class OnlineSlam:
         pose = self.frame.to_map(local, int(answer["anchor"]), number)
         return self.labels.label(deskew(beams, answer["twist"]), pose)
 
-    def placement(self) -> tuple[Float, NDArray[np.int64]]:
+    def placement(self) -> tuple[Float, Int64]:
         """Poses and submaps of the scans that are kept, as they are known now: see `Snapshot`."""
         notes, is_whole = self.history.notes(), self.history.kept == len(self.history)
         poses = self._finder.move_all(notes["local"])
@@ -226,7 +224,7 @@ class OnlineSlam:
         return Observation(beams, T, margin, self.frame.tag)
 
     def _add_to_maps(
-        self, observation: Observation, e: NDArray[np.float32], registered: Registration
+        self, observation: Observation, e: Float32, registered: Registration
     ) -> MappedScan | None:
         """Add a scan to the local map and, if it is spaced, to the pose graph, and go on correcting
         the map; the scan if it is spaced."""
@@ -244,7 +242,7 @@ class OnlineSlam:
             self._path_begin = 0
         return added
 
-    def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
+    def _label_again(self, scan: MappedScan) -> Float32:
         """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
         T, hit = self.frame.T_map_local @ scan.T_map_base, scan.beams.hit
         e = np.nan_to_num(self.labels.label(scan.beams, T))
@@ -271,9 +269,7 @@ class OnlineSlam:
         )
         return dataclasses.replace(self._in_map_frame(found), changes=update.changes)
 
-    def _to_update(
-        self, stamp_ns: int, registered: Registration, p_static: NDArray[np.float32]
-    ) -> Update:
+    def _to_update(self, stamp_ns: int, registered: Registration, p_static: Float32) -> Update:
         doubts = {
             "slip": registered.is_slipping,
             "blind": registered.is_blind,
@@ -323,7 +319,7 @@ class OnlineSlam:
         )
 
     @property
-    def cell_shift(self) -> NDArray[np.int64]:
+    def cell_shift(self) -> Int64:
         """(D,) by which the labels' cells are shifted in the map frame."""
         shift = self.known_frame.origin[: self.dimension] / self.resolution
         return np.asarray(np.round(shift), np.int64)

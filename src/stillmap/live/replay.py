@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from types import FrameType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, no_progress, peak_memory_bytes
 from stillmap.core.recording import Recording
@@ -31,7 +31,7 @@ class Latency:
         peak_memory_bytes: of the process.
     """
 
-    seconds: NDArray[np.float64]
+    seconds: Float
     dropped: int
     peak_memory_bytes: int
 

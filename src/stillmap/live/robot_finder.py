@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Int64
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import Localizer, OwnMap
 from stillmap.live.map_frame import FrontEnd, MapFrame
-
-Float = NDArray[np.float64]
 
 _COVARIANCE = np.diag(np.square([0.1, 0.1, 0.02]))  # m, m, rad: of a pose that was found
 # of the scans that agreed with the map before others contradicted it, the last ones: somewhere else
@@ -171,7 +169,7 @@ class RobotFinder:
                 out[stretch.slice()] = stretch.T @ out[stretch.slice()]
         return out
 
-    def submaps(self, scans: int) -> NDArray[np.int64]:
+    def submaps(self, scans: int) -> Int64:
         """(T,) of all scans so far, see `Placement`."""
         out = np.zeros(scans, np.int64)
         for number, stretch in enumerate(self._stretches, 1):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.arrays import empty, write_npy
 from stillmap.core.errors import advise, cannot_write
 from stillmap.core.files import require_new, resolve_output
@@ -63,10 +64,10 @@ class Snapshot(ShortRepr):
     """
 
     recording: Recording
-    given: NDArray[np.float64]
-    p_static: NDArray[np.float32]
-    poses: NDArray[np.float64]
-    submap: NDArray[np.int64]
+    given: Float
+    p_static: Float32
+    poses: Float
+    submap: Int64
     options: Options
     folder: Path | None = None
     kept_map: KeptMap | None = None

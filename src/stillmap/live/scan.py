@@ -7,10 +7,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.arrays import finite_rows
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -26,8 +27,6 @@ from stillmap.io.rigid_transforms import MAX_MOUNT
 from stillmap.prepare.max_range import MAX_ZERO_RANGE
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.slam import scan_hits
-
-Float = NDArray[np.float64]
 
 # m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves
 # with the robot
@@ -87,11 +86,11 @@ class ScanBeams(ShortRepr):
     """
 
     stamp_ns: int
-    points: NDArray[np.float32]
-    hit: NDArray[np.bool_]
+    points: Float32
+    hit: Bool
     T_base_sensor: Float
     sensor: str | int = 0
-    beam_time: NDArray[np.float32] | None = None
+    beam_time: Float32 | None = None
 
     @classmethod
     def of(cls, recording: Recording, number: int, name: str | int | None = None) -> ScanBeams:
@@ -145,7 +144,7 @@ def drop_cover(beams: ScanBeams) -> ScanBeams:
     return replace(beams, points=nothing, hit=np.zeros_like(beams.hit))
 
 
-def take_beams(beams: ScanBeams, kept: NDArray[np.intp] | slice) -> ScanBeams:
+def take_beams(beams: ScanBeams, kept: Index | slice) -> ScanBeams:
     """Some beams of a scan, copied."""
     times = None if beams.beam_time is None else beams.beam_time[kept].copy()
     points, hit = np.ascontiguousarray(beams.points[kept]), beams.hit[kept].copy()
@@ -174,7 +173,7 @@ def deskew(beams: ScanBeams, twist: Float) -> ScanBeams:
     return replace(beams, points=points, beam_time=None)
 
 
-def _from_ranges(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _from_ranges(scan: Scan) -> tuple[Float32, Bool]:
     if scan.ranges is None or scan.angles is None:
         raise ValueError("scan: expected ranges and angles, or points")
     ranges = to_array("ranges", scan.ranges, "(N,)").astype(np.float64)
@@ -190,13 +189,13 @@ def _from_ranges(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     return points.astype(np.float32), usable & ~beyond
 
 
-def _from_points(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _from_points(scan: Scan) -> tuple[Float32, Bool]:
     points = np.array(scan.points, np.float32)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(f"points: expected (N, 2) or (N, 3), got {points.shape}")
     finite = finite_rows(points)
     near = np.linalg.norm(np.where(finite[:, None], points, 0.0), axis=1)
-    usable: NDArray[np.bool_] = finite & (near >= max(scan.min_range, MAX_ZERO_RANGE))
+    usable: Bool = finite & (near >= max(scan.min_range, MAX_ZERO_RANGE))
     usable &= near < MAX_PLAUSIBLE_RANGE
     points[~usable] = np.nan
     if scan.hit is None:
@@ -229,7 +228,7 @@ class Observation(ShortRepr):
 
     beams: ScanBeams
     T: Float
-    margin: NDArray[np.float32] | None
+    margin: Float32 | None
     tag: int = 0
 
 
@@ -246,7 +245,7 @@ class BeamSelector:
         # of each sensor: running mean of ns between its scans, their number, the last stamp
         self._rates = dict[str | int, tuple[float, int, int]]()
 
-    def select(self, beams: ScanBeams) -> NDArray[np.bool_]:
+    def select(self, beams: ScanBeams) -> Bool:
         """(N,) beams to follow, others in every scan."""
         period_ns, count, last_ns = self._rates.get(beams.sensor, (np.inf, 0, 0))
         step = float(beams.stamp_ns - last_ns)
@@ -259,9 +258,7 @@ class BeamSelector:
         return np.asarray((np.arange(len(beams.points)) + count + 1) % stride == 0)
 
 
-def find_margins(
-    beams: ScanBeams, hits: scan_hits.Scan, followed: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def find_margins(beams: ScanBeams, hits: scan_hits.Scan, followed: Bool) -> Float32:
     """(N,) margins of the beams of a planar scan, see `Observation`.
 
     Args:

@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan
 from stillmap.live.odometry_faults import DeadReckoning, Fault, OdometryFaults, is_plausible
@@ -26,8 +26,6 @@ from stillmap.slam.scan_matching import (
     match_scan,
     widen_match,
 )
-
-Float = NDArray[np.float64]
 
 _MAX_REGISTERED = 600  # end points of a scan that are registered
 _KERNEL = np.radians(1.0)  # std of the normals about the direction of a wall
@@ -139,7 +137,7 @@ class ScanOdometry:
         self.crowd.observe(hits.points, self._faults.increment, beams.stamp_ns)
         return hits
 
-    def end_points(self, hits: Scan, prior: MotionPrior) -> tuple[NDArray[np.float32], Float]:
+    def end_points(self, hits: Scan, prior: MotionPrior) -> tuple[Float32, Float]:
         """(N, 2) points in the base frame at the stamp, and its pose, as predicted."""
         return hits.points, prior.T_map_base
 
@@ -187,7 +185,7 @@ class ScanOdometry:
         return Registration(T, covariance, match.explained, drift, twist, *doubts)
 
     def add(
-        self, beams: ScanBeams, e: NDArray[np.float32], recent: NDArray[np.float32], label: Labeller
+        self, beams: ScanBeams, e: Float32, recent: Float32, label: Labeller
     ) -> MappedScan | None:
         """Add the last scan to the local map, unless it contradicts it or is too close to the one
         before; the scan if it was added.

@@ -4,9 +4,9 @@ verifies."""
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
 from stillmap.live.global_localization import GlobalLocalizer, Localizer
 from stillmap.live.known_cloud import KnownCloud, KnownPlanes
@@ -18,8 +18,6 @@ from stillmap.slam import lidar_odometry
 from stillmap.slam.constant_velocity import State
 from stillmap.slam.lidar_odometry import Sweep
 from stillmap.slam.loop_closure_3d import MIN_PLANE_OVERLAP, plane_overlap
-
-Float = NDArray[np.float64]
 
 # std of a pose that the planar search proposes: m, rad; m/s and rad/s, which are known by then
 _STD = np.repeat([0.3, 0.05, 0.05], [3, 3, 6])

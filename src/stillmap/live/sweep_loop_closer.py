@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
 from stillmap.live.local_map import MappedScan, SpacedScans
 from stillmap.live.loop_closer import Correction
 from stillmap.slam import loop_closure
@@ -17,9 +18,6 @@ from stillmap.slam.lidar_odometry import LidarOdometry
 from stillmap.slam.loop_closure_3d import MAX_CHI2, LoopSearch, SweepLoopCloser
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopClosure, LoopContext
-
-Float = NDArray[np.float64]
-View = NDArray[np.float32]
 
 _RINGS, _RING_WIDTH = 20, 2.0  # m; farther points are rare
 _SECTORS = 60
@@ -46,7 +44,7 @@ class Candidate(NamedTuple):
     similarity: float
 
 
-def view_from_above(points: NDArray[np.floating]) -> View:
+def view_from_above(points: NDArray[np.floating]) -> Float32:
     """(R, S) height of the highest points (N, 3), in the base frame, by distance and azimuth; less
     the mean of all, and scaled to length 1."""
     ring = np.floor(np.hypot(points[:, 0], points[:, 1]) / _RING_WIDTH).astype(np.int64)
@@ -60,7 +58,7 @@ def view_from_above(points: NDArray[np.floating]) -> View:
     return (out / max(float(np.linalg.norm(out)), 1e-9)).astype(np.float32)
 
 
-def find_alike(view: View, earlier: View, count: int) -> list[Candidate]:
+def find_alike(view: Float32, earlier: Float32, count: int) -> list[Candidate]:
     """The sweeps that look most alike, best first, turned as they fit best.
 
     Args:
@@ -96,7 +94,7 @@ class LiveSweepLoopCloser:
         self._found: list[LoopClosure] = []
         self._search = LoopSearch(0)
         self._searched = 0
-        self._from_above = list[View]()  # views of the first keyframes
+        self._from_above = list[Float32]()  # views of the first keyframes
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
         """Add a keyframe at its pose in the frame of the odometry by scans; drift: infinite if the
@@ -155,7 +153,7 @@ class LiveSweepLoopCloser:
                 return closure
         return None
 
-    def _view(self, context: LoopContext, k: int) -> View:
+    def _view(self, context: LoopContext, k: int) -> Float32:
         scan = self._scans.scan(context, k)
         use = scan.beams.hit & (scan.e >= _STATIC)
         points, T = scan.beams.points[use], scan.beams.T_base_sensor

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float, Float32
 from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.known_cloud import KnownPlanes
 from stillmap.live.local_map import Labeller, MappedScan
@@ -16,8 +16,6 @@ from stillmap.slam.lidar_odometry import Sweep
 from stillmap.slam.local_map import KEYFRAME_ANGLE
 from stillmap.slam.loop_closure_3d import KEYFRAME_DISTANCE
 from stillmap.slam.options import SlamOptions
-
-Float = NDArray[np.float64]
 
 # sweeps from which the motion during the first one is found; m/s and rad/s of it that matter
 _FIRST_SWEEPS, _MIN_MOTION = 5, 0.05
@@ -80,7 +78,7 @@ class SweepOdometry:
         )
         return sweep
 
-    def end_points(self, hits: Sweep, prior: State) -> tuple[NDArray[np.float32], Float]:
+    def end_points(self, hits: Sweep, prior: State) -> tuple[Float32, Float]:
         """(N, 3) points in the base frame at the stamp, and its pose, as predicted."""
         return hits.deskew(prior.twist), prior.T_map_base
 
@@ -115,11 +113,7 @@ class SweepOdometry:
         )
 
     def add(
-        self,
-        beams: ScanBeams,
-        e: NDArray[np.float32],
-        _recent: NDArray[np.float32],
-        _label: Labeller,
+        self, beams: ScanBeams, e: Float32, _recent: Float32, _label: Labeller
     ) -> MappedScan | None:
         """Add the last sweep to the local map, unless it contradicts it; the sweep if it is a
         keyframe.
@@ -142,7 +136,7 @@ class SweepOdometry:
         self._since = 0.0
         return MappedScan(kept, weights, state.T_map_base, self.travelled)
 
-    def _add(self, points: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
+    def _add(self, points: Float32, weights: Float32) -> None:
         """Add points (N, 3) in the base frame to the local map, and forget what is far away."""
         state = self._state
         self.local_map.add(points, weights, state.T_map_base)

@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.arrays import unique_cells
 from stillmap.core.grid_map import GridMap
 from stillmap.em import CellProbabilities, GroundMap
@@ -13,10 +13,7 @@ from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.local_map import MappedScan
 from stillmap.mapping.projection import project_cells
 
-Float = NDArray[np.float64]
-
 STANDS = 0.5  # P(static and occupied) of a cell that counts as surface
-Index = NDArray[np.int64]
 
 # m from the sensor to which the surroundings are compared: farther off sweeps show little of them
 _MAX_RANGE = 40.0
@@ -53,7 +50,7 @@ def project_obstacles(
     return _draw([(cells[:, :2], 0.0), (obstacles.cells, obstacles.p_occupied)], cell)
 
 
-def _draw(layers: list[tuple[Index, Any]], edge: float) -> GridMap:
+def _draw(layers: list[tuple[Int64, Any]], edge: float) -> GridMap:
     """The map of (N, 2) cells with probabilities, later layers over earlier ones; NaN: unknown."""
     every = np.concatenate([cells for cells, _ in layers])
     if not len(every):
@@ -74,7 +71,7 @@ def find_ground(known: CellProbabilities, positions: Float, cell: float) -> Grou
     return fit_ground(np.asarray((floor + 0.5) * cell, np.float64), positions)
 
 
-def is_level(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def is_level(cells: Int64) -> Bool:
     """(K,) cells (K, 3) without one right above: those of walls have one."""
     low = cells.min(axis=0)
     size = cells.max(axis=0) - low + 2

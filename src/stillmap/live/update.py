@@ -3,14 +3,10 @@
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
-
-Float = NDArray[np.float64]
 
 # for people
 DOUBTS = MappingProxyType(
@@ -35,7 +31,7 @@ class LaterLabels(ShortRepr):
     """
 
     number: int
-    p_static: NDArray[np.float32]
+    p_static: Float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +55,7 @@ class Update(ShortRepr):
 
     pose: Float
     covariance: Float
-    p_static: NDArray[np.float32]
+    p_static: Float32
     T_map_odom: Float | None
     doubts: tuple[str, ...] = ()
     changes: list[MapChange] = field(default_factory=list)

@@ -9,9 +9,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import frame_name, stamp_ns
@@ -22,7 +20,6 @@ from stillmap.live.scan import ScanBeams
 if TYPE_CHECKING:
     from stillmap.live.ros.transforms import Transforms
 
-Float = NDArray[np.float64]
 
 NO_STAMP = "scan without a stamp"
 BACKWARDS = "stamp before that of an earlier scan"

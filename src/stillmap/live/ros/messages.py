@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.io.ros.clouds import parse_cloud
 from stillmap.io.ros.lasers import ScanShape
 from stillmap.io.ros.messages import stamp_ns
@@ -14,8 +15,6 @@ from stillmap.pipeline.options import MapMode
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.results.map_server import raw_pixels
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
-
-Float = NDArray[np.float64]
 
 _MAX_SCAN_TIME = 1.0  # s: time increments that make scans longer are none
 
@@ -123,7 +122,7 @@ def spread_covariance(covariance: Float) -> Float:
     return out.ravel()
 
 
-def to_cells(p_occupied: NDArray[np.float32], mode: MapMode) -> NDArray[np.int8]:
+def to_cells(p_occupied: Float32, mode: MapMode) -> NDArray[np.int8]:
     """(H, W) cells of an OccupancyGrid: 0 free, 100 occupied, -1 unknown; in mode raw per cent.
 
     nav2 takes all between 0 and 100 for free unless it is told otherwise, hence the modes.
@@ -136,9 +135,7 @@ def to_cells(p_occupied: NDArray[np.float32], mode: MapMode) -> NDArray[np.int8]
     return raw_pixels(p_occupied).view(np.int8)  # 255 is -1
 
 
-def split_ranges(
-    ranges: NDArray[np.float32], hit: NDArray[np.bool_], p_static: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def split_ranges(ranges: Float32, hit: Bool, p_static: Float32) -> tuple[Float32, Float32]:
     """The ranges (N,) of what is static and of what is dynamic.
 
     Dynamic beams are +inf among the static ones, where readings that met nothing stay as they are.
@@ -149,7 +146,7 @@ def split_ranges(
     return np.where(is_dynamic, none, ranges), np.where(is_dynamic, ranges, none)
 
 
-def end_points(message: Any, beams: ScanBeams, chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
+def end_points(message: Any, beams: ScanBeams, chosen: Bool) -> Float32:
     """(n, 3) end points of the chosen beams (N,) of a scan in the frame of its message."""
     if beams.dimension == 3:
         return beams.points[chosen]

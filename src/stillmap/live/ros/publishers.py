@@ -19,6 +19,7 @@ from tf2_ros import TransformBroadcaster
 from visualization_msgs.msg import Marker, MarkerArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.grid_map import GridMap
 from stillmap.io.rigid_transforms import embed_in_3d, quaternion_from_pose
 from stillmap.io.ros.messages import stamp_ns
@@ -35,7 +36,6 @@ try:
 except ImportError:
     OccupancyGridUpdate = None
 
-Float = NDArray[np.float64]
 
 _DEPTH, _SCAN_DEPTH = 10, 5  # messages kept for readers that fall behind
 _PERIOD_NS = 10**9  # between two updates of the map
@@ -140,7 +140,7 @@ class Publishers:
         if markers:
             self._markers.publish(MarkerArray(markers=markers))
 
-    def _publish_scan(self, arrival: Arrival, p_static: NDArray[np.float32]) -> None:
+    def _publish_scan(self, arrival: Arrival, p_static: Float32) -> None:
         """TOPIC_static, TOPIC_dynamic and TOPIC_points of a scan with P(static) (N,), for those who
         listen."""
         *parts, points = self._scans[arrival.topic]
@@ -251,7 +251,7 @@ class MapPublisher:
         return _box(low.min(axis=0), high.max(axis=0))
 
 
-def _box(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, slice]:
+def _box(low: Int64, high: Int64) -> tuple[slice, slice]:
     (bottom, left), (top, right) = low.tolist(), high.tolist()
     return slice(bottom, top), slice(left, right)
 
@@ -284,7 +284,7 @@ def _to_markers(mover: Mover, header: Any) -> list[Any]:
     return [body, arrow, text]
 
 
-def _to_cloud(arrival: Arrival, p_static: NDArray[np.float32], chosen: NDArray[np.bool_]) -> Any:
+def _to_cloud(arrival: Arrival, p_static: Float32, chosen: Bool) -> Any:
     """A PointCloud2 of the chosen (N,) end points of a scan with their P(static)."""
     points = end_points(arrival.message, arrival.beams, chosen)
     rows, header = np.column_stack([points, p_static[chosen]]), arrival.message.header

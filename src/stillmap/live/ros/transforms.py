@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Transform, TransformStamped, Vector3
-from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
@@ -12,13 +11,12 @@ from std_msgs.msg import Header
 from tf2_ros import Buffer, TransformException
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.ros.messages import frame_name
 from stillmap.io.ros.tf import project_to_plane
 from stillmap.live.ros.messages import Mount
 from stillmap.live.ros.parameters import Parameters
-
-Float = NDArray[np.float64]
 
 _MESSAGES, _ROBOT = "odometry", "robot"  # frames of Odometry messages in a buffer of their own
 
