@@ -15,12 +15,8 @@ class Run:
     def __init__(self, simulation, threads=1):
         self.recording, self.truth = simulation.recording, simulation.truth
         self.mapper = LiveMapper({"threads": threads})
-        odometry = self.recording.T_odom_base
         self.beams = list(iter_beams(self.recording))
-        self.updates = [
-            self.mapper.push(beams, None if odometry is None else odometry[t])
-            for t, beams in enumerate(self.beams)
-        ]
+        self.updates = push_all(self.mapper, self.recording)
 
     @property
     def poses(self):
@@ -31,14 +27,19 @@ class Run:
         return np.concatenate([update.p_static for update in self.updates])
 
 
+def push_all(mapper, recording, scans=None):
+    """Push the scans of a recording, or the first of them; the updates."""
+    odometry = recording.T_odom_base
+    return [
+        mapper.push(beams, None if odometry is None else odometry[t])
+        for t, beams in enumerate(islice(iter_beams(recording), scans))
+    ]
+
+
 def answers(recording, scans=None, **settings):
     """What a new mapper answers to the scans of a recording, or the first of them."""
-    odometry = recording.T_odom_base
     with LiveMapper({"threads": 1}, **settings) as mapper:
-        return [
-            mapper.push(beams, None if odometry is None else odometry[t])
-            for t, beams in enumerate(islice(iter_beams(recording), scans))
-        ]
+        return push_all(mapper, recording, scans)
 
 
 def poses_of(updates):
@@ -49,3 +50,14 @@ def simulate_sweeps(scene, scans, seed=3):
     """A recording of a spinning lidar, and its truth."""
     lidar = {"channels": 24, "columns": 600}
     return simulate(scene_by_name(scene, {"lidar": lidar, "robot": {"scans": scans}}), seed)
+
+
+def distances_to_walls(grid, truth, T_world_map):
+    """(n,) m from the occupied cells of a map to the nearest wall."""
+    rows, columns = np.nonzero(grid.p_occupied > 0.65)
+    at = (np.stack([columns, rows], axis=1) + 0.5) * grid.resolution + grid.origin[:2]
+    at = at @ T_world_map[:2, :2].T + T_world_map[:2, 2]
+    a, b = truth.walls[:, :2], truth.walls[:, 2:]
+    along = np.einsum("nwd,wd->nw", at[:, None] - a, b - a) / ((b - a) ** 2).sum(axis=1)
+    off = at[:, None] - a - np.clip(along, 0, 1)[..., None] * (b - a)
+    return np.linalg.norm(off, axis=2).min(axis=1)

@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from live_runs import push_all
 
 import stillmap
 from stillmap.io.trajectory import read_tum
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.replay import iter_beams
 from stillmap.results.reader import read_grid
 from stillmap.sim import scene_by_name, simulate
 
@@ -20,7 +20,7 @@ SCANS = 60
 def hall(tmp_path_factory):
     """A recording of a hall, and its map near the origin and in a projection."""
     folder = tmp_path_factory.mktemp("far")
-    made = simulate(scene_by_name("hall", {"crowd": {"people": 0}, "robot": {"scans": 400}}), 2)
+    made = simulate(scene_by_name("hall", {"crowd": {"people": 0}, "robot": {"scans": 250}}), 2)
     for name, by in (("near", np.zeros(2)), ("far", UTM)):
         poses = made.truth.T_world_base.copy()
         poses[:, :2, 2] += by - made.truth.T_world_base[0, :2, 2]
@@ -32,10 +32,7 @@ def hall(tmp_path_factory):
 
 def drive(recording, place, mode="localise"):
     mapper = LiveMapper({"threads": 1}, place=place, mode=mode)
-    odometry, updates = recording.T_odom_base, []
-    for k, beams in zip(range(SCANS), iter_beams(recording), strict=False):
-        updates.append(mapper.push(beams, odometry[k]))
-    return mapper, updates
+    return mapper, push_all(mapper, recording, SCANS)
 
 
 # m: rounding moves single scans, as their cost has steps where end points leave observed space

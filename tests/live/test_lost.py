@@ -6,6 +6,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from live_runs import distances_to_walls
 
 import stillmap
 from stillmap.core import se2
@@ -75,15 +76,8 @@ def test_the_saved_map_has_the_known_ones(run, worlds):
     np.testing.assert_allclose(saved.poses, poses[known], atol=1e-6)
     p_static = np.load(folder / "live/beams/p_static.npy")
     assert len(p_static) == len(saved.p_static)
-    rows, columns = np.nonzero(saved.map.p_occupied > 0.65)
-    at = (np.stack([columns, rows], axis=1) + 0.5) * saved.map.resolution + saved.map.origin[:2]
-    hall = worlds[0].truth
-    T = hall.T_world_base[0] @ se2.inverse(poses[0])
-    at = at @ T[:2, :2].T + T[:2, 2]
-    a, b = hall.walls[:, :2], hall.walls[:, 2:]
-    along = np.einsum("nwd,wd->nw", at[:, None] - a, b - a) / ((b - a) ** 2).sum(axis=1)
-    off = at[:, None] - a - np.clip(along, 0, 1)[..., None] * (b - a)
-    assert np.mean(np.linalg.norm(off, axis=2).min(axis=1) > 0.2) < 0.01
+    T = worlds[0].truth.T_world_base[0] @ se2.inverse(poses[0])
+    assert np.mean(distances_to_walls(saved.map, worlds[0].truth, T) > 0.2) < 0.01
 
 
 @pytest.mark.slow

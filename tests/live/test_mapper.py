@@ -1,20 +1,17 @@
 """The live mapper on a simulated corridor: causal poses, labels and map."""
 
-import itertools
 import json
-import time
 
 import numpy as np
 import pytest
-from live_runs import answers, poses_of
+from live_runs import answers, distances_to_walls, poses_of, push_all
 
 import stillmap
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
 from stillmap.live.causal_labels import CausalLabels, take_over
-from stillmap.live.loop_closer import Correction
-from stillmap.live.map_frame import MapCorrection, rotate_covariance
+from stillmap.live.map_frame import rotate_covariance
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.live.scan import Observation, to_beams
@@ -40,55 +37,32 @@ def f1(p_static, static, use):
     return 2 * (says & moves).sum() / (says.sum() + moves.sum())
 
 
-def test_poses_as_they_were_given_are_those_of_the_truth(corridor):
+def test_poses_and_labels_are_those_of_the_truth(corridor):
     errors = compute_absolute_errors(corridor.poses, corridor.truth.T_world_base)
     assert errors.rmse < 0.05
     assert errors.max < 0.15
-
-
-def test_poses_as_they_are_known_at_the_end_are_no_worse(corridor):
-    poses = corridor.mapper.poses
-    assert len(poses) == corridor.recording.n_scans
-    errors = compute_absolute_errors(poses, corridor.truth.T_world_base)
-    assert errors.rmse < 0.05
-    np.testing.assert_allclose(poses[-1], corridor.updates[-1].pose, atol=1e-9)
-
-
-def test_movers_are_told_at_once(corridor):
     assert f1(corridor.p_static, corridor.truth.static, corridor.recording.hit) > 0.85
     assert np.isnan(corridor.p_static[np.isnan(corridor.recording.points).any(axis=1)]).all()
-
-
-def test_odometry_and_its_correction_give_the_pose(corridor):
     for t in (0, 100, 399):
-        update = corridor.updates[t]
-        np.testing.assert_allclose(
-            update.T_map_odom @ corridor.recording.T_odom_base[t], update.pose, atol=1e-9
-        )
+        T = corridor.updates[t].T_map_odom @ corridor.recording.T_odom_base[t]
+        np.testing.assert_allclose(T, corridor.updates[t].pose, atol=1e-9)
 
 
-def test_the_answer_depends_on_earlier_scans_alone(corridor, fresh):
-    again = fresh()
-    odometry = corridor.recording.T_odom_base
-    for t, beams in zip(range(60), iter_beams(corridor.recording), strict=False):
-        update = again.push(beams, odometry[t])
-        np.testing.assert_array_equal(update.pose, corridor.updates[t].pose)
-        np.testing.assert_array_equal(update.p_static, corridor.updates[t].p_static)
+def test_poses_and_path_as_they_are_known_at_the_end(corridor):
+    poses, path = corridor.mapper.poses, corridor.mapper.path
+    assert len(poses) == corridor.recording.n_scans
+    assert compute_absolute_errors(poses, corridor.truth.T_world_base).rmse < 0.05
+    np.testing.assert_allclose(poses[-1], corridor.updates[-1].pose, atol=1e-9)
+    assert 20 < len(path) < len(poses)
+    assert np.linalg.norm(np.diff(path[:, :2, 2], axis=0), axis=1).max() < 0.5
+    nearest = np.linalg.norm(path[:, None, :2, 2] - poses[None, :, :2, 2], axis=2).min(axis=1)
+    assert nearest.max() < 1e-6
 
 
 def test_the_map_shows_walls_and_nobody(corridor):
-    grid = corridor.mapper.map
-    rows, columns = np.nonzero(grid.p_occupied > 0.65)
-    assert len(rows) > 500
-    x, y = grid.origin[:2]
-    cells = np.stack([columns, rows], axis=1) + 0.5
     T = corridor.truth.T_world_base[0]  # the map has the frame of the first scan
-    world = (cells * grid.resolution + [x, y]) @ T[:2, :2].T + T[:2, 2]
-    a, b = corridor.truth.walls[:, :2], corridor.truth.walls[:, 2:]
-    along = np.clip(
-        np.einsum("nwd,wd->nw", world[:, None] - a, b - a) / ((b - a) ** 2).sum(axis=1), 0, 1
-    )
-    distance = np.linalg.norm(world[:, None] - a - along[..., None] * (b - a), axis=2).min(axis=1)
+    distance = distances_to_walls(corridor.mapper.map, corridor.truth, T)
+    assert len(distance) > 500
     assert np.mean(distance > 0.15) < 0.03
 
 
@@ -123,38 +97,6 @@ def test_parts_that_emptied_are_told():
     expected = labels.to_map().p_occupied
     np.testing.assert_array_equal(np.sort(known), np.sort(expected[~np.isnan(expected)]))
     assert labels.take_changes(2 * 10**9) == []
-
-
-def test_cells_hit_while_a_correction_goes_on_move_with_it():
-    labels = CausalLabels(2, 0.05, EmOptions())
-    angles, margin = np.linspace(-1.0, 1.0, 200), np.full(200, 0.1, np.float32)
-
-    def see(stamp, tag):
-        beams = to_beams(stillmap.Scan(stamp, np.full(200, 3.0), angles))
-        labels.add(Observation(beams, np.eye(3), margin, tag), np.eye(3))
-
-    see(0, 0)
-    T, here = se2.matrix(2.0, 0.0, 0.0), np.eye(3)[None]
-    correction = MapCorrection(Correction(T, T[None], []), labels, here, here, np.array([0]))
-    see(10**9, 1)  # after the next spaced scan
-    while not correction.step(labels):
-        pass
-    correction.finish(labels)
-    grid = labels.to_map()
-    x = grid.origin[0] + 0.05 * np.nonzero(grid.p_occupied > 0.5)[1]
-    assert len(x) > 50
-    assert x.min() > 2.0 + 3.0 * np.cos(1.0) - 0.1
-
-
-def test_the_path_is_that_of_spaced_scans(corridor):
-    path = corridor.mapper.path
-    assert 20 < len(path) < corridor.recording.n_scans
-    steps = np.linalg.norm(np.diff(path[:, :2, 2], axis=0), axis=1)
-    assert steps.max() < 0.5
-    # corrected, as `poses` are
-    at = corridor.mapper.poses[:, :2, 2]
-    nearest = np.linalg.norm(path[:, None, :2, 2] - at[None], axis=2).min(axis=1)
-    assert nearest.max() < 1e-6
 
 
 def test_a_saved_run_is_a_result(corridor, tmp_path):
@@ -229,37 +171,12 @@ def test_a_mapper_that_is_closed_says_so(corridor, tmp_path):
             call()
 
 
-def push_all(mapper, recording, count=None):
-    odometry = recording.T_odom_base
-    beams = itertools.islice(iter_beams(recording), count)
-    return [mapper.push(scan, odometry[t]) for t, scan in enumerate(beams)]
-
-
 def test_loops_are_closed_in_the_background(corridor, fresh):
     mapper = fresh(background=True)
     updates = push_all(mapper, corridor.recording)
     poses = poses_of(updates)
     assert compute_absolute_errors(poses, corridor.truth.T_world_base).rmse < 0.06
     assert compute_absolute_errors(mapper.poses, corridor.truth.T_world_base).rmse < 0.06
-
-
-def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh, caplog):
-    mapper = fresh(background=True)
-    push_all(mapper, corridor.recording, 50)
-    process = mapper._slam.frame._closer._process
-    process.kill()
-    while process.poll() is None:
-        time.sleep(0.01)
-    odometry = corridor.recording.T_odom_base
-    waiting = []
-    for t, beams in enumerate(itertools.islice(iter_beams(corridor.recording), 50, 150), 50):
-        update = mapper.push(beams, odometry[t])
-        waiting.append(mapper._slam.frame._closer._outgoing.qsize())
-    truth = corridor.truth.T_world_base
-    moved = se2.inverse(truth[0]) @ truth[149]
-    np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
-    assert sum("closes loops" in record.message for record in caplog.records) == 1
-    assert waiting[-1] <= waiting[10]  # nobody takes anything out
 
 
 def test_a_covariance_follows_the_axes_of_its_frame():
@@ -284,16 +201,9 @@ def test_answers_do_not_depend_on_when_the_map_is_updated(corridor):
             np.testing.assert_array_equal(update.pose, expected.pose)
             np.testing.assert_array_equal(update.p_static, expected.p_static)
             assert len(update.changes) == len(expected.changes)
-        update.p_static[:] = 0.0  # of the user from now on
-        mapper.push(corridor.beams[count], odometry[count])
-        assert len(mapper.poses) == count + 1
-
-
-def test_what_is_kept_does_not_change_with_the_answer(corridor):
-    with LiveMapper({"threads": 1}) as mapper:
-        update = mapper.push(corridor.beams[0], corridor.recording.T_odom_base[0])
-        update.p_static[:] = update.pose[:] = 0.0
+        update.p_static[:] = update.pose[:] = 0.0  # of the user from now on
         snapshot = mapper.snapshot()
-        np.testing.assert_array_equal(snapshot.p_static, corridor.updates[0].p_static)
-        np.testing.assert_array_equal(snapshot.given, corridor.poses[:1])
-        assert snapshot.recording.n_scans == 1
+    last = corridor.updates[count - 1]
+    np.testing.assert_array_equal(snapshot.p_static[-len(last.p_static) :], last.p_static)
+    np.testing.assert_array_equal(snapshot.given[-1], last.pose)
+    assert snapshot.recording.n_scans == count
