@@ -26,12 +26,6 @@ def test_a_box_that_came():
     np.testing.assert_array_equal(one.swept_cells, one.cells)
 
 
-def test_a_box_that_left():
-    (one,) = found(course(BOX, False, (40, 43)))
-    assert one.kind == "left"
-    assert not one.appeared
-
-
 def test_a_moved_box_left_one_place_and_came_to_the_other():
     # a cell apart and at the same time, but of two kinds
     old, new = course(BOX, False, (40, 43)), course(beside(5), True, (41, 44))
@@ -59,10 +53,6 @@ def test_the_time_is_that_between_all_looks_of_the_place():
     (one,) = found(*parts)
     assert seconds(one) == (38, 41, 41)
     assert len(one.cells) == 12
-
-
-# halves are no small parts
-BOX_TOP, BOX_BOTTOM = course(BOX[:6], True, (40, 41)), course(BOX[6:], True, (42, 43))
 
 
 @pytest.mark.parametrize(("least", "places"), [(1, 1), (12, 1), (13, 0)])

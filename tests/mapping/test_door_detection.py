@@ -105,19 +105,16 @@ def test_a_leaf_at_rest_is_free_at_its_end_and_beside():
     assert len(find_resting_leaf(line, wall, fine)) == 0
 
 
-def test_what_is_seen_in_one_position_only_is_no_door():
-    changes = [LEFT, CAME]
-    found = joined(changes, WALL, *looks(["shut"] * 40 + [None] * 60))
-    assert [one.kind for one in found] == ["came", "left"]
-
-
-def test_two_sides_of_a_box_that_are_seen_in_turn_are_no_door():
-    found = joined([LEFT, CAME], WALL, *looks(["shut"] * 40 + ["open"] * 60, passing=False))
-    assert [one.kind for one in found] == ["came", "left"]
-
-
-def test_who_walks_by_once_is_no_leaf():
-    found = joined([LEFT, CAME], WALL, *looks(["shut"] + ["open"] * 99))
+@pytest.mark.parametrize(
+    ("positions", "passing"),
+    [
+        (["shut"] * 40 + [None] * 60, True),  # seen in one position only
+        (["shut"] * 40 + ["open"] * 60, False),  # two sides of a box that are seen in turn
+        (["shut"] + ["open"] * 99, True),  # who walks by once
+    ],
+)
+def test_what_is_no_leaf_is_no_door(positions, passing):
+    found = joined([LEFT, CAME], WALL, *looks(positions, passing=passing))
     assert [one.kind for one in found] == ["came", "left"]
 
 

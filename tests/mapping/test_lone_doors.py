@@ -12,39 +12,16 @@ from rooms import drive
 import stillmap
 from stillmap.core.config import override
 from stillmap.mapping.doors import Door, DoorState
-from stillmap.mapping.lone_doors import compute_p_moved
 from stillmap.pipeline.options import Options
 from stillmap.sim.walls import box
 
 S = 10**9
-GAP = 19  # cells, of the doorway
-
-
-def row(start, angle, length):
-    """Cells of a straight row, rising."""
-    t = np.arange(0.0, length, 0.4)[:, None]
-    along = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
-    return np.unique(np.round(np.array(start) + t * along).astype(np.int64), axis=0)
-
-
-def cells(*rows):
-    return np.unique(np.concatenate(rows), axis=0)
-
-
-def leaf(angle=100.0, length=GAP, at=(40.0, 3.0)):
-    """Hinged at the left end, behind a wall of 0.15 m."""
-    return [row(at, angle, length), row((40, 0), 90, 4)]
 
 
 def door(*states):
     stamps = [DoorState(position, since * S, until * S) for position, since, until in states]
     none = np.empty((0, 2), np.int64)
     return Door((0.0, 0.0), 0.9, 0.0, 1.5, none, none, none, tuple(stamps))
-
-
-def p_moved(doors, *looks, seconds=300):
-    stamps = [np.array(one, np.int64) * S for one in looks]
-    return compute_p_moved(doors, stamps, np.array([0, seconds]) * S)[1]
 
 
 HINGE, OPENED = (0.5, 0.15), math.radians(100.0)

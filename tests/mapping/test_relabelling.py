@@ -120,7 +120,7 @@ def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, st
     assert occupied.free_prior == known.occupied.free_prior
 
 
-@pytest.mark.parametrize(("beams", "threads"), [(50, 1), (50, 3), (10**6, 2)])
+@pytest.mark.parametrize(("beams", "threads"), [(50, 3), (10**6, 2)])
 def test_pieces_and_threads_change_no_bit(known, monkeypatch, beams, threads):
     one, of_one = known.relabelled()
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)

@@ -11,7 +11,7 @@ from stillmap.cli.main import main
 def days(tmp_path_factory) -> Path:
     """A folder with three short sessions of an office, mapped: out-1, out-2, out-3."""
     folder = tmp_path_factory.mktemp("days")
-    words = ["simulate", "hall", "-o", str(folder / "sim"), "--sessions", "3", "--scans", "260"]
+    words = ["simulate", "hall", "-o", str(folder / "sim"), "--sessions", "3", "--scans", "200"]
     assert main([*words, "--seed", "5", "--quiet"]) == 0
     for k in (1, 2, 3):
         session = folder / "sim" / f"session-{k}"

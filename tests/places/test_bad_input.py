@@ -17,21 +17,14 @@ from stillmap.core.errors import InputError
 from stillmap.places import finish, store
 
 
-def damage(path: Path) -> dict[str, bytes | None]:
-    """Other contents of a file, by what was done to it; None: it is gone."""
+def damage(path: Path) -> list[bytes | None]:
+    """Other contents of a file; None: it is gone."""
     whole = path.read_bytes()
     noise = np.random.default_rng(1).integers(0, 256, len(whole), dtype=np.uint8).tobytes()
-    out: dict[str, bytes | None] = {
-        "gone": None,
-        "empty": b"",
-        "half": whole[: len(whole) // 2],
-        "noise": noise,
-    }
+    out = [None, b"", whole[: len(whole) // 2], noise]
     if path.suffix == ".npy":
         array = np.load(path)
-        out["a row less"] = dump(array[:-1])
-        out["other values"] = dump(np.zeros_like(array) if array.any() else np.ones_like(array))
-        out["text"] = dump(array.astype("U4"))
+        out += [dump(array[:-1]), dump(array.astype("U4"))]
     return out
 
 
@@ -45,10 +38,14 @@ def dump(array: np.ndarray) -> bytes:
 OUTPUTS = ("trajectory.tum", "beams/p_static.npy", "objects/", "state/objects/")
 
 
-@pytest.mark.slow
-def test_a_session_that_was_changed_by_hand(flat_place: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "place"
-    shutil.copytree(flat_place, copy)
+@pytest.fixture
+def copy(flat_place: Path, tmp_path: Path) -> Path:
+    """A copy of a place, to be damaged."""
+    shutil.copytree(flat_place, tmp_path / "place")
+    return tmp_path / "place"
+
+
+def test_damaged_files_are_named(copy: Path) -> None:
     home = copy / "sessions" / "map2"
     paths = [
         path
@@ -58,39 +55,16 @@ def test_a_session_that_was_changed_by_hand(flat_place: Path, tmp_path: Path) ->
     assert len(paths) > 20
     for path in [*paths, copy / "run.json", copy / "sessions.json", copy / "ties.npz"]:
         whole = path.read_bytes()
-        for how, content in damage(path).items():
+        for content in damage(path):
             path.unlink(missing_ok=True)
             if content is not None:
                 path.write_bytes(content)
-            if how == "other values":
-                continue  # see `test_values_that_cannot_be`
             with pytest.raises(InputError) as caught:
                 store.read_place(copy)
-            said = str(caught.value)
-            assert str(copy) in said, (path, how)
-            assert "\n" not in said
+            assert str(copy) in str(caught.value), path
+            assert "\n" not in str(caught.value)
         path.write_bytes(whole)
     store.read_place(copy)
-
-
-def test_damaged_state_is_named(flat_place: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "place"
-    shutil.copytree(flat_place, copy)
-    state = copy / "sessions" / "map2" / "state"
-    refused = 0
-    for path in sorted(state.rglob("*.np[yz]")):
-        whole = path.read_bytes()
-        for how, content in damage(path).items():
-            if how == "other values":
-                continue
-            path.unlink(missing_ok=True)
-            if content is not None:
-                path.write_bytes(content)
-            with pytest.raises(InputError):
-                store.read_place(copy)
-            refused += 1
-        path.write_bytes(whole)
-    assert refused > 60
 
 
 @pytest.mark.parametrize(
@@ -110,9 +84,7 @@ def test_damaged_state_is_named(flat_place: Path, tmp_path: Path) -> None:
         ("beams/stamp_ns.npy", lambda a: a[::-1]),
     ],
 )
-def test_values_that_cannot_be(flat_place: Path, tmp_path: Path, name, change) -> None:
-    copy = tmp_path / "place"
-    shutil.copytree(flat_place, copy)
+def test_values_that_cannot_be(copy: Path, name, change) -> None:
     path = copy / "sessions" / "map2" / name
     path.write_bytes(dump(np.ascontiguousarray(change(np.load(path)))))
     with pytest.raises(InputError) as caught:
@@ -122,28 +94,21 @@ def test_values_that_cannot_be(flat_place: Path, tmp_path: Path, name, change) -
 
 EDITS = {
     "no list": lambda _: {"name": "map1"},
-    "no sessions": lambda _: [],
     "a session less": lambda records: records[:1],
-    "another name": lambda records: [records[0], {**records[1], "name": "tuesday"}],
     "a path as name": lambda records: [records[0], {**records[1], "name": "../map1"}],
     "accepted changed": lambda records: [records[0], {**records[1], "accepted": False}],
-    "overlap as text": lambda records: [records[0], {**records[1], "overlap": "much"}],
 }
 
 
 @pytest.mark.parametrize("edit", EDITS)
-def test_a_list_of_sessions_that_was_edited(flat_place: Path, tmp_path: Path, edit: str) -> None:
-    copy = tmp_path / "place"
-    shutil.copytree(flat_place, copy)
+def test_a_list_of_sessions_that_was_edited(copy: Path, edit: str) -> None:
     path = copy / "sessions.json"
     path.write_text(json.dumps(EDITS[edit](json.loads(path.read_text()))))
     with pytest.raises(InputError, match=r"sessions\.json"):
         store.read_place(copy)
 
 
-def test_a_session_whose_folder_is_gone(flat_place: Path, flat_days: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "place"
-    shutil.copytree(flat_place, copy)
+def test_a_session_whose_folder_is_gone(copy: Path, flat_days: Path, tmp_path: Path) -> None:
     shutil.rmtree(copy / "sessions" / "map2")
     with pytest.raises(InputError, match=r"map2.*cannot be read"):
         stillmap.merge([copy, flat_days / "map3"], options=OPTIONS, output=tmp_path / "out")

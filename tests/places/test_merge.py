@@ -2,17 +2,18 @@
 
 import filecmp
 import json
-import shutil
+import re
 
 import numpy as np
 import pytest
+from report_page import Page
 
 from stillmap.cli.main import main
 from stillmap.core import se2
-from stillmap.core.errors import InputError
 from stillmap.io.trajectory import read_tum
-from stillmap.places.store import read_place
 from stillmap.results.reader import read_grid, read_labels
+from stillmap.results.report.place_pictures import PlacePictures
+from stillmap.results.timeline import read_timeline
 
 # what a result of one recording has, and what a place adds
 FILES = {
@@ -145,14 +146,6 @@ def test_the_map_shows_the_state_that_is_asked_for(days, place, tmp_path):
     assert inside.mean() > 0.8
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("state", ["yesterday", "1970-01-01"])
-def test_a_state_that_is_none_is_refused(days, tmp_path, state, capsys):
-    assert merge(days / "out-1", days / "out-2", "-o", tmp_path / "x", "--map-state", state) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
-    assert not list(tmp_path.iterdir())
-
-
 def test_sessions_of_unrelated_places_are_refused(days, tmp_path, capsys):
     words = ["simulate", "office", "-o", str(tmp_path / "sim"), "--scans", "260", "--quiet"]
     assert main(words) == 0
@@ -163,22 +156,19 @@ def test_sessions_of_unrelated_places_are_refused(days, tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.slow
-def test_one_that_does_not_belong_does_not_change_the_others(days, place, tmp_path):
-    words = ["simulate", "office", "-o", str(tmp_path / "sim"), "--scans", "260", "--quiet"]
-    assert main(words) == 0
-    results = [days / "out-1", days / "out-2", tmp_path / "sim", days / "out-3"]
-    assert merge(*results, "-o", tmp_path / "x") == 0
-    found = {one["name"]: one for one in records(tmp_path / "x")}
-    assert not found["sim"]["accepted"]
-    assert found["sim"]["why"]
-    assert not (tmp_path / "x" / "sessions" / "sim").exists()
-    assert differing_files(place, tmp_path / "x") <= {"run.json", "sessions.json", "report.html"}
+def test_merge_writes_the_report(place):
+    page = Page((place / "report.html").read_text(encoding="utf-8"))
+    changes = json.loads((place / "changes.json").read_text())
+    assert changes
+    listed = [row[1] for row in page.rows if re.fullmatch(r"[AGMD]\d+", row[0])]
+    assert listed == [one["kind"] for one in changes]
 
 
-def test_a_place_that_was_changed_by_hand_is_refused(place, tmp_path):
-    copy = tmp_path / "place"
-    shutil.copytree(place, copy)
-    (copy / "sessions" / "out-2" / "state" / "nodes.npy").write_bytes(b"")
-    with pytest.raises(InputError, match=r"nodes\.npy"):
-        read_place(copy)
+def test_map_as_of_the_last_session_is_the_map(place):
+    pictures = PlacePictures(read_grid(place), read_timeline(place))
+    shown, of_last = (
+        np.array(one.convert("RGB")) for one in (pictures.draw_map(), pictures.draw(2))
+    )
+    colored = np.ptp(of_last.astype(int), axis=2) > 30  # what changed since the second one
+    assert 0 < colored.sum() < 0.02 * colored.size
+    assert (shown == of_last)[~colored].all()

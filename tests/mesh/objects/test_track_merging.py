@@ -1,4 +1,4 @@
-"""Which tracks are of one thing."""
+"""Which beams met a thing that moves, and which tracks are of one thing."""
 
 import dataclasses
 
@@ -7,8 +7,34 @@ from made_up_street import Car, Part, street
 
 from stillmap.mesh.inputs import MeshInputs, TrackedBox
 from stillmap.mesh.reconstruction import reconstruct_object
-from stillmap.mesh.returns import DynamicReturns, collect_tracks, merge_tracks
+from stillmap.mesh.returns import (
+    DynamicReturns,
+    cluster_points,
+    collect_tracks,
+    merge_tracks,
+    segment_object,
+)
 from stillmap.tracking.boxes import fit_box
+
+TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
+
+
+def test_a_thing_has_what_ended_in_its_box_and_nothing_of_others() -> None:
+    sources = street(TWO, [Part(0), Part(1)])
+    moves = DynamicReturns.collect(sources)
+    for one, thing in zip(sources.objects, sources.boxes, strict=True):
+        own = segment_object(one, thing, moves)
+        np.testing.assert_array_equal(moves.beam[own], one.beams)
+
+
+def test_links_are_longer_where_beams_lie_farther_apart() -> None:
+    y = np.array([0.0, 0.3, 0.6, 2.0, 2.3])
+    for away, pieces in ((2.0, 2), (60.0, 1)):
+        points = np.stack([np.full(5, away), y, np.zeros(5)], axis=1)
+        piece = cluster_points(points, np.zeros(3))
+        assert len(set(piece[:3])) == len(set(piece[3:])) == 1
+        assert len(set(piece)) == pieces
+
 
 CAR = Car((6.0, -2.5), (6.0, 0.0))
 

@@ -1,15 +1,12 @@
 """Things that stand between a camera and what it sees."""
 
 import numpy as np
-import pytest
 
-from stillmap.mesh import inputs
 from stillmap.mesh.inputs import (
     OrientedBox,
     TrackedBox,
     boxes_at,
     is_in_or_behind_box,
-    occlusion_probability,
 )
 from stillmap.tracking.boxes import Box
 
@@ -38,23 +35,6 @@ def test_a_thing_is_on_its_way_and_a_little_beyond() -> None:
     np.testing.assert_allclose(before.center, [-0.3, 0.0, 0.9])
     assert boxes_at([_walker()], 2.6) == []
     assert boxes_at([_walker()], -0.6) == []
-
-
-@pytest.fixture
-def wide_outlines(monkeypatch):
-    monkeypatch.setattr(inputs, "OUTLINE_MARGIN", 0.1)
-    monkeypatch.setattr(inputs, "_OUTLINE_SIGMA", 0.1)
-
-
-@pytest.mark.usefixtures("wide_outlines")
-def test_who_stands_before_a_wall_hides_it_and_nobody_hides_what_is_nearer() -> None:
-    one = OrientedBox(np.array([3.0, 0.0, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.3, 0.9]))
-    points = np.array([[5.0, 0, 1], [2.0, 0, 1], [5, 3, 1], [5.0, 0, 4.0], [5.0, 0.75, 1.0]])
-    p = occlusion_probability([one], np.array([0.0, 0.0, 1.0]), points)
-    assert p[0] > 0.98
-    np.testing.assert_array_equal(p[1:4], 0.0)
-    # 0.75 * 3.1 / 5 = 0.47 to the side of its middle: within a sigma of the margin's edge
-    assert 0.3 < p[4] < 0.7
 
 
 def _meets_by_sampling(start: np.ndarray, end: np.ndarray, half: np.ndarray) -> bool:

@@ -46,8 +46,11 @@ def walked(room):
     return room.scans(room.lidar(360, 40), poses, noise=0.01), poses
 
 
-def test_the_room_is_where_it_is(room, walked):
+def test_the_room_is_where_it_is_with_any_number_of_threads(room, walked):
     mesh = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
+    threaded = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS, threads=3)
+    assert mesh.vertices.tobytes() == threaded.vertices.tobytes()
+    assert mesh.faces.tobytes() == threaded.faces.tobytes()
     at, face = samples(mesh)
     off = room.off_walls(at)
     assert off.mean() < 0.006
@@ -55,15 +58,12 @@ def test_the_room_is_where_it_is(room, walked):
     inward = mesh.normals()[face]
     middle = room.corners.mean(axis=0)
     assert np.mean(np.einsum("ni,ni->n", inward, middle - at) > 0) > 0.999
+    # voxels behind a surface end without another one
+    assert room.off_walls(mesh.vertices).max() < 0.15
+    outside = np.maximum(room.corners[0] - mesh.vertices, mesh.vertices - room.corners[1])
+    assert outside.max() < 0.05
     # beams at 0.5 rad up and down see all of the walls but not all of the floor
     assert mesh.areas().sum() > 70.0
-
-
-def test_threads_do_not_change_a_bit(walked):
-    one = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
-    two = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS, threads=3)
-    assert one.vertices.tobytes() == two.vertices.tobytes()
-    assert one.faces.tobytes() == two.faces.tobytes()
 
 
 def test_what_moves_is_no_surface(room):
@@ -85,14 +85,6 @@ def test_what_moves_is_no_surface(room):
 
     assert on_box(cleaned) == 0
     assert on_box(raw) > 100
-
-
-def test_no_wall_behind_the_wall(room, walked):
-    """Voxels behind a surface end without another one."""
-    mesh = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
-    assert room.off_walls(mesh.vertices).max() < 0.15
-    outside = np.maximum(room.corners[0] - mesh.vertices, mesh.vertices - room.corners[1])
-    assert outside.max() < 0.05
 
 
 def test_tiles_join_without_a_crack(walked, monkeypatch):

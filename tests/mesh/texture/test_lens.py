@@ -17,18 +17,8 @@ POINTS = np.array(
 BY_OPENCV = [
     (
         "plumb_bob",
-        [-0.28, 0.09, 1e-3, -2e-3, 0.0],
-        [[396.5660463937175, 116.40177041527735], [126.26769260645202, 43.432529539154416]],
-    ),
-    (
-        "plumb_bob",
         [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
         [[400.4912467499093, 110.1278544739227], [100.90086891736871, 15.699165409979685]],
-    ),
-    (
-        "plumb_bob",
-        [-0.3, 0.1, 0.001, 0.002],
-        [[396.7116180603468, 116.46915591472167], [129.10551740660654, 45.52101058657777]],
     ),
     (
         "rational_polynomial",
@@ -113,16 +103,11 @@ def test_rays_lead_through_their_pixels(model, distortion, _):
 @pytest.mark.parametrize(
     ("given", "why"),
     [
-        (Camera("c", 1, 1, None, "", np.zeros(0), None), "without calibration"),
         (Camera("c", 1, 1, np.zeros((3, 3)), "", np.zeros(0), None), "invalid calibration"),
         (Camera("c", 1, 1, np.full((3, 3), np.nan), "", np.zeros(0), None), "invalid calibration"),
         (Camera("c", 1, 1, np.full((3, 3), 1e200), "", np.zeros(0), None), "invalid calibration"),
-        (Camera("c", 1, 1, 1e-200 * np.eye(3), "", np.zeros(0), None), "invalid calibration"),
         (camera("plumb_bob", [0.1, 1e200, 0.0, 0.0]), "far too large"),
-        (camera("double_sphere", [0.1, 0.2]), "unknown model (double_sphere)"),
         (camera("plumb_bob", [0.1, 0.2]), "2 parameters (plumb_bob)"),
-        (camera("", [0.1]), "1 parameters (none)"),
-        (camera("plumb_bob", [0.1, np.nan, 0.0, 0.0]), "not finite"),
     ],
 )
 def test_what_cannot_be_used_says_why(given, why):
