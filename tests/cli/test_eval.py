@@ -127,14 +127,10 @@ def test_bad_lines_are_named(capsys, texts):
     assert f"{texts.relations}:3" in said
 
 
-@pytest.mark.parametrize(
-    "flags", [["--max-dt", "-1"], ["--max-dt", "nan"], ["--max-dt", "x"], ["--delta", "0"]]
-)
+@pytest.mark.parametrize("flags", [["--max-dt", "-1"], ["--max-dt", "nan"], ["--delta", "0"]])
 def test_impossible_numbers_are_refused(capsys, texts, flags):
-    with pytest.raises(SystemExit) as caught:
-        main(["eval", "trajectory", str(texts.trajectory), str(texts.trajectory), *flags])
-    assert caught.value.code == 2
-    assert flags[0] in capsys.readouterr().err
+    said = refusal(capsys, "trajectory", texts.trajectory, texts.trajectory, *flags)
+    assert flags[0] in said
 
 
 def test_trajectory(capsys, simulated, result):

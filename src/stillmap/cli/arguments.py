@@ -1,9 +1,20 @@
-"""Flags made from the options, and checks of output paths; shared by the commands."""
+"""Flags as text, the options that they set, and checks of output paths; shared by the commands.
+
+A command has a table of its flags and arguments, one a line; lines that go on are indented.
+
+    NAMES [TAKES] [= DEFAULT] [-> DEST]  HELP
+
+TAKES is what follows, as the help calls it, and several words stand for several values. It ends
+with `!` if the flag is required, with `?`, `*` or `+` as in regular expressions, with `...` if the
+flag can be given again; `{a,b}` are choices. A flag without it is a switch, which sets DEST=VALUE.
+Without HELP, the option DEST gives everything. One of the flags behind `|` can be given. A line
+that ends with a colon begins a group.
+"""
 
 import argparse
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,42 +34,118 @@ if TYPE_CHECKING:
     from stillmap.pipeline.options import Options
     from stillmap.prepare.options import ReadOptions
 
-# flag -> option, which gives help, type, choices and default
-_READ_FLAGS = {
-    "--min-range": "read.min_range",
-    "--max-range": "read.max_range",
-    "--zero-means": "read.zero_means",
-    "--spin": "read.spin",
-    "--cameras": "read.cameras",
-    "--topic": "read.topic",
-    "--base-frame": "read.base_frame",
-    "--odom-frame": "read.odom_frame",
-    "--laser-upside-down": "read.laser_upside_down",
-    "--laser2-upside-down": "read.laser2_upside_down",
-    "--from": "read.start",
-}
-_END = "read.end"  # its flag is --to or --until: `convert --to` is a format
-_PLACE_FLAGS = {"--resolution": "slam.resolution", "--map-mode": "output.map_mode"}
-_MAP_FLAGS = {
-    "--mesh": "mesh.enabled",
-    **_PLACE_FLAGS,
-    "--region": "output.region",
-    "--map-state": "output.map_state",
-}
+OVERWRITE = "--overwrite  replace what is there\n"
+JSON = "--json  a summary as one JSON object on stdout\n"
+NO_ODOMETRY = "--no-odometry  ignore odometry in the recording\n"
+RUN = f"--threads -> threads\n{JSON}"
+PLACE_MAP = """
+--resolution -> slam.resolution
+--map-mode -> output.map_mode
+"""
+METHOD = f"""
+method:
+| --paper -> estimator=paper  the method exactly as printed
+| --estimator -> estimator
+--poses FILE.tum  keep these poses; `recording`: the poses stored in the recording
+{NO_ODOMETRY}
+map:
+--mesh -> mesh.enabled
+{PLACE_MAP}
+--region -> output.region
+--map-state -> output.map_state
+"""
+OTHERS = """
+any other option, see `stillmap config`:
+--config FILE.toml  options from a TOML file
+--set SECTION.KEY=VALUE... -> assignments  one option, e.g. em.prior=0.8; can be given again
+"""
+READ = """
+reading the recording:
+--min-range -> read.min_range
+--max-range -> read.max_range
+--zero-means -> read.zero_means
+--spin -> read.spin
+--cameras -> read.cameras
+--topic -> read.topic
+--base-frame -> read.base_frame
+--odom-frame -> read.odom_frame
+--laser-upside-down -> read.laser_upside_down
+--laser2-upside-down -> read.laser2_upside_down
+--from -> read.start
+--to --until -> read.end
+--laser-offset X Y DEG  pose of the first laser on the robot: m ahead, m left, degrees to the left
+--laser-fov DEG -> read.laser_fov  field of view of the first laser in FLASER and RLASER lines
+  (default: 180)
+--laser2-offset X Y DEG  pose of the second laser likewise
+--laser2-fov DEG -> read.laser2_fov  field of view of the second laser likewise (default: 180)
+"""
+
+_ROW = re.compile(
+    r"(?P<either>\| )?(?P<names>[\w-]+( -[\w-]+)*)"
+    r"( (?P<takes>[^-= |].*?)(?P<nargs>\.\.\.|[!?*+])?)?( = (?P<default>\S+))?"
+    r"( -> (?P<dest>[\w.]+)(=(?P<value>\w+))?)?(  (?P<help>.*))?"
+)
+
+
+def degrees(text: str) -> float:
+    """The radians of a number of degrees on the command line."""
+    return math.radians(float(text))
+
+
+# of what follows a flag; others are texts
+_TYPES = {"N": int, "DEG": degrees, **dict.fromkeys(("S", "M", "P", "X", "HZ", "GB"), float)}
 _UNITS = {"metre": "M", "second": "S", "file": "FILE.toml", "topic": "TOPIC", "frame": "FRAME"}
+_KINDS = {"float": float, "int": int}
 
 
-def add_flags(
-    group: argparse._ActionsContainer, flags: Mapping[str, str], options: Any, prefix: str = ""
-) -> None:
-    """Add flags that set options; the name of the option is the argument's."""
-    infos = {info.name: info for info in iter_options(options, prefix)}
-    for flag, name in flags.items():
-        group.add_argument(*flag.split(), dest=name, **_settings(infos[name]))
+def add_flags(p: argparse.ArgumentParser, table: str) -> None:
+    """Add the flags and arguments of a table to the parser of a command."""
+    group: argparse._ActionsContainer = p
+    either: argparse._ActionsContainer | None = None
+    for line in re.sub(r"\n +", " ", table).splitlines():
+        row = _ROW.fullmatch(line)
+        if line.endswith(":"):
+            group, either = p.add_argument_group(line[:-1]), None
+        elif row is not None and row["either"]:
+            either = either or group.add_mutually_exclusive_group()
+            either.add_argument(*row["names"].split(), **_settings(row))
+        elif row is not None:
+            group.add_argument(*row["names"].split(), **_settings(row))
+        elif line:
+            raise ValueError(f"flags: expected NAMES TAKES  HELP, got {line}")
 
 
-def _settings(info: OptionInfo) -> dict[str, Any]:
-    """Arguments of `add_argument` for an option."""
+def _settings(row: re.Match[str]) -> dict[str, Any]:
+    """Arguments of `add_argument` for a line of a table."""
+    settings: dict[str, Any] = {"dest": row["dest"]} if row["dest"] else {}
+    if row["help"] is None:
+        return settings | _settings_of_option(row["dest"])
+    settings["help"] = row["help"]
+    if row["takes"] is None:
+        value = row["value"]
+        const, default = (True, False) if value is None else (value, None)
+        return settings | {"action": "store_const", "const": const, "default": default}
+    words, nargs = row["takes"].split(), row["nargs"]
+    settings["type"] = _TYPES.get(row["takes"], str) if len(words) == 1 else float
+    if row["takes"].startswith("{"):
+        settings["choices"] = row["takes"].strip("{}").split(",")
+    else:
+        settings["metavar"] = words[0] if len(words) == 1 else tuple(words)
+    if row["default"] is not None:
+        settings["default"] = settings["type"](row["default"])
+        settings["help"] += " (default: %(default)s)"
+    if nargs == "...":
+        settings |= {"action": "append", "default": []}
+    elif nargs == "!":
+        settings["required"] = True
+    elif nargs or len(words) > 1:
+        settings["nargs"] = nargs or len(words)
+    return settings
+
+
+def _settings_of_option(name: str) -> dict[str, Any]:
+    """Arguments of `add_argument` for a flag that sets an option."""
+    info = _find_option(name)
     kind, default = info.kind.removesuffix(" or unset"), info.default
     shown = "" if default is None or kind == "bool" else f" (default: {default})"
     settings: dict[str, Any] = {"help": info.doc.replace("%", "%%") + shown}
@@ -71,93 +158,20 @@ def _settings(info: OptionInfo) -> dict[str, Any]:
     if info.name == "read.topic":
         settings["action"] = "append"
     unit = next((short for word, short in _UNITS.items() if word in info.doc.lower()), "N")
-    return settings | {"type": {"float": float, "int": int}.get(kind, str), "metavar": unit}
+    return settings | {"type": _KINDS.get(kind, str), "metavar": unit}
 
 
-def add_read_flags(
-    p: argparse.ArgumentParser, end_flags: tuple[str, ...] = ("--to", "--until")
-) -> None:
-    """Add the flags for reading a recording to a command; `end_flags` name the end of its part."""
-    from stillmap.prepare.options import ReadOptions
+def _find_option(name: str) -> OptionInfo:
+    """An option by name; all but those of reading take long to load."""
+    if name.startswith("read."):
+        from stillmap.prepare.options import ReadOptions
 
-    group = p.add_argument_group("reading the recording")
-    add_flags(group, _READ_FLAGS | {" ".join(end_flags): _END}, ReadOptions(), "read.")
-    for laser in ("laser", "laser2"):
-        which = "second" if laser == "laser2" else "first"
-        group.add_argument(
-            f"--{laser}-offset",
-            type=float,
-            nargs=3,
-            metavar=("X", "Y", "DEG"),
-            help=f"pose of the {which} laser on the robot: m ahead, m left, degrees to the left",
-        )
-        group.add_argument(
-            f"--{laser}-fov",
-            dest=f"read.{laser}_fov",
-            type=_radians,
-            metavar="DEG",
-            help=f"field of view of the {which} laser in FLASER and RLASER lines (default: 180)",
-        )
+        options = iter_options(ReadOptions(), "read.")
+    else:
+        from stillmap.pipeline.options import DEFAULTS
 
-
-def _radians(degrees: str) -> float:
-    return math.radians(float(degrees))
-
-
-def add_run_flags(p: argparse.ArgumentParser) -> None:
-    """Add the flags of how the command itself runs and what it prints."""
-    from stillmap.pipeline.options import DEFAULTS
-
-    add_flags(p, {"--threads": "threads"}, DEFAULTS)
-    p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
-    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
-
-
-def add_method_flags(p: argparse._ArgumentGroup) -> None:
-    """Add the flags that choose how poses and labels are estimated."""
-    from stillmap.pipeline.options import DEFAULTS
-
-    either = p.add_mutually_exclusive_group()
-    either.add_argument(
-        "--paper",
-        dest="estimator",
-        action="store_const",
-        const="paper",
-        help="the method exactly as printed",
-    )
-    add_flags(either, {"--estimator": "estimator"}, DEFAULTS)
-    p.add_argument(
-        "--poses",
-        metavar="FILE.tum",
-        help="keep these poses; `recording`: the poses stored in the recording",
-    )
-    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
-
-
-def add_map_flags(p: argparse._ActionsContainer, *, whole: bool = True) -> None:
-    """Add the flags of the map that is written; `whole`: all of them, not of a place alone."""
-    from stillmap.pipeline.options import DEFAULTS
-
-    add_flags(p, _MAP_FLAGS if whole else _PLACE_FLAGS, DEFAULTS)
-
-
-def add_option_flags(p: argparse.ArgumentParser) -> None:
-    """Add `--config` and `--set`."""
-    group = p.add_argument_group("any other option, see `stillmap config`")
-    group.add_argument("--config", metavar="FILE.toml", help="options from a TOML file")
-    add_set_flag(group, "one option, e.g. em.prior=0.8; can be given again")
-
-
-def add_set_flag(p: argparse._ActionsContainer, help: str) -> None:
-    """Add `--set`; the last value of an option counts."""
-    p.add_argument(
-        "--set",
-        dest="assignments",
-        metavar="SECTION.KEY=VALUE",
-        action="append",
-        default=[],
-        help=help,
-    )
+        options = iter_options(DEFAULTS)
+    return next(info for info in options if info.name == name)
 
 
 def flag_changes(args: argparse.Namespace) -> dict[str, Any]:

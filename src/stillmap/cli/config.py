@@ -2,7 +2,7 @@
 
 import argparse
 
-from stillmap.cli.arguments import add_option_flags, options_from_args
+from stillmap.cli.arguments import OTHERS, options_from_args
 from stillmap.cli.console import print_json, print_lines
 
 DESCRIPTION = (
@@ -17,17 +17,10 @@ EPILOG = """examples:
 """
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument(
-        "only",
-        metavar="NAME",
-        nargs="?",
-        default="",
-        help="one section or option, e.g. slam.odometry",
-    )
-    p.add_argument("--json", action="store_true", help="one JSON object on stdout, by option")
-    add_option_flags(p)
+FLAGS = f"""
+only NAME?  one section or option, e.g. slam.odometry
+--json  one JSON object on stdout, by option
+{OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:

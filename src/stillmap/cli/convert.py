@@ -3,17 +3,12 @@
 import argparse
 from pathlib import Path
 
-from stillmap.cli.arguments import (
-    add_read_flags,
-    make_parents,
-    read_options,
-    require_apart,
-)
+from stillmap.cli.arguments import OVERWRITE, READ, make_parents, read_options, require_apart
 from stillmap.cli.console import say, show_share
 from stillmap.cli.convert_result import (
     CLOUDS,
     NAV2,
-    add_zone_flags,
+    ZONE_FLAGS,
     convert_result,
     given_zone_flags,
 )
@@ -46,26 +41,13 @@ EPILOG = """examples:
 """
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument(
-        "input",
-        metavar="INPUT",
-        help="a recording, or a folder that `stillmap map` or `merge` wrote",
-    )
-    p.add_argument("-o", "--output", metavar="FILE", required=True, help="converted file or folder")
-    names = (*NAMES, NAV2)
-    p.add_argument("--to", metavar="FORMAT", choices=names, help=f"the format: {', '.join(names)}")
-    p.add_argument(
-        "--input", dest="recording", metavar="FILE", help="a result's recording, if it was moved"
-    )
-    p.add_argument(
-        "--only", choices=("static", "dynamic"), help="these points of a cloud (default: all)"
-    )
-    p.add_argument("--overwrite", action="store_true", help="replace what is there")
-    p.add_argument("--quiet", action="store_true", help="no summary")
-    add_zone_flags(p)
-    add_read_flags(p, end_flags=("--until",))  # --to is the format
+FLAGS = f"""
+input INPUT  a recording, or a folder that `stillmap map` or `merge` wrote
+-o --output FILE!  converted file or folder
+--to {{{",".join((*NAMES, NAV2))}}}  the format
+--input FILE -> recording  a result's recording, if it was moved
+--only {{static,dynamic}}  these points of a cloud (default: all)
+{OVERWRITE}{ZONE_FLAGS}{READ.replace("--to ", "")}"""
 
 
 def run(args: argparse.Namespace) -> int:

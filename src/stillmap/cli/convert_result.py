@@ -21,34 +21,14 @@ NAV2 = "nav2"  # the format of maps and masks
 _PARQUET = ".parquet"
 
 
-def add_zone_flags(p: argparse.ArgumentParser) -> None:
-    """Add the flags for maps and masks."""
-    group = p.add_argument_group(
-        "maps and masks of a result for nav2, in a folder (docs/tutorials/2d-bag-to-nav2.md)"
-    )
-    group.add_argument(
-        "--mask",
-        metavar="FILE.geojson",
-        help="polygons in metres in the map frame, each with an action: erase, block, keepout, "
-        "or speed",
-    )
-    group.add_argument(
-        "--keepout-crossings",
-        type=int,
-        metavar="N",
-        help="keep out of the squares of the floor that were crossed N times or more",
-    )
-    group.add_argument(
-        "--slow-crossings",
-        type=int,
-        metavar="N",
-        help="limit the speed in the squares that were crossed N times or more",
-    )
-    group.add_argument(
-        "--slow-to",
-        metavar="LIMIT",
-        help="to LIMIT in m/s, or in per cent of the robot's maximum (default: 50%%)",
-    )
+ZONE_FLAGS = """
+maps and masks of a result for nav2, in a folder (docs/tutorials/2d-bag-to-nav2.md):
+--mask FILE.geojson  polygons in metres in the map frame, each with an action: erase, block,
+  keepout, or speed
+--keepout-crossings N  keep out of the squares of the floor that were crossed N times or more
+--slow-crossings N  limit the speed in the squares that were crossed N times or more
+--slow-to LIMIT  to LIMIT in m/s, or in per cent of the robot's maximum (default: 50%%)
+"""
 
 
 def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:

@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import make_parents, require_apart
+from stillmap.cli.arguments import JSON, OVERWRITE, make_parents, require_apart
 from stillmap.cli.console import print_json, say, show_share
 from stillmap.cli.convert import NAMES
 from stillmap.core.errors import InputError
@@ -38,27 +38,13 @@ EPILOG = """examples:
 _INDEX = "filtered.json"  # the list of what the folder of a place holds
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument("result", metavar="DIR", help="folder that `stillmap map` or `merge` wrote")
-    p.add_argument("-o", "--output", metavar="FILE", required=True, help="filtered recording")
-    p.add_argument(
-        "--to",
-        metavar="FORMAT",
-        choices=NAMES,
-        help=f"another format: {', '.join(NAMES)} (default: by the ending of FILE, else its own)",
-    )
-    p.add_argument("--input", metavar="FILE", help="the recording, if it was moved")
-    p.add_argument(
-        "--below",
-        metavar="P",
-        type=float,
-        default=0.5,
-        help="blank beams whose P(static) is below P (default: %(default)g)",
-    )
-    p.add_argument("--overwrite", action="store_true", help="replace what is there")
-    p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
-    p.add_argument("--quiet", action="store_true", help="no summary")
+FLAGS = f"""
+result DIR  folder that `stillmap map` or `merge` wrote
+-o --output FILE!  filtered recording
+--to {{{",".join(NAMES)}}}  another format (default: by the ending of FILE, else its own)
+--input FILE  the recording, if it was moved
+--below P = 0.5  blank beams whose P(static) is below P
+{OVERWRITE}{JSON}"""
 
 
 def run(args: argparse.Namespace) -> int:

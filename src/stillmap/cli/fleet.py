@@ -7,13 +7,7 @@ import shlex
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from stillmap.cli.arguments import (
-    add_map_flags,
-    add_method_flags,
-    add_option_flags,
-    add_read_flags,
-    options_from_args,
-)
+from stillmap.cli.arguments import METHOD, OTHERS, READ, options_from_args
 from stillmap.cli.console import fail, print_json, say, show_tasks
 from stillmap.core.errors import InputError
 
@@ -43,39 +37,16 @@ exit status: 0 all were mapped; 3 some failed, each is named; 2 the call is at f
 """
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument(
-        "inputs",
-        metavar="INPUT",
-        nargs="*",
-        help="a recording, a folder of recordings, a pattern in quotes; a URL likewise",
-    )
-    p.add_argument(
-        "-o", "--output", metavar="DIR", required=True, help="folder or URL of all results"
-    )
-    p.add_argument(
-        "--manifest", metavar="FILE", help="list of recordings, each with its place: CSV or JSON"
-    )
-    p.add_argument("--merge", action="store_true", help="all INPUTs are of one place: merge them")
-    p.add_argument(
-        "--jobs", metavar="N", type=int, help="recordings at once (default: one per processor)"
-    )
-    p.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        default="",
-        help="run on the workers of this Dask scheduler, which share DIR, instead of here",
-    )
-    p.add_argument(
-        "--threads", metavar="N", type=int, default=1, help="of each recording (default: 1)"
-    )
-    p.add_argument("--json", action="store_true", help="the content of fleet.json on stdout")
-    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    add_method_flags(p.add_argument_group("method"))
-    add_map_flags(p.add_argument_group("map"))
-    add_read_flags(p)
-    add_option_flags(p)
+FLAGS = f"""
+inputs INPUT*  a recording, a folder of recordings, a pattern in quotes; a URL likewise
+-o --output DIR!  folder or URL of all results
+--manifest FILE  list of recordings, each with its place: CSV or JSON
+--merge  all INPUTs are of one place: merge them
+--jobs N  recordings at once (default: one per processor)
+--scheduler ADDRESS  run on the workers of this Dask scheduler, which share DIR, instead of here
+--threads N = 1  of each recording
+--json  the content of fleet.json on stdout
+{METHOD}{READ}{OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from stillmap.cli.arguments import add_option_flags, add_read_flags, read_options
+from stillmap.cli.arguments import JSON, OTHERS, READ, read_options
 from stillmap.cli.console import format_rows, print_lines, show_share
 
 # entries of the summary that its text does not show, or shows in its heading
@@ -33,15 +33,9 @@ formats:
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    parser.add_argument(
-        "input", metavar="INPUT", nargs="+", help="a file or folder with a recording"
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-    add_read_flags(parser)
-    add_option_flags(parser)
+FLAGS = f"""
+input INPUT+  a file or folder with a recording
+{JSON}{READ}{OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:

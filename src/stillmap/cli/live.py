@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import (
-    add_map_flags,
-    add_option_flags,
-    add_read_flags,
-    add_run_flags,
+    NO_ODOMETRY,
+    OTHERS,
+    OVERWRITE,
+    PLACE_MAP,
+    READ,
+    RUN,
     make_parents,
     options_from_args,
     require_apart,
@@ -45,37 +47,25 @@ EPILOG = """examples:
 """
 
 
+FLAGS = f"""
+--replay INPUT  a recording (default: a ROS 2 node that maps until Ctrl-C)
+-o --output DIR!  result folder
+{OVERWRITE}
+--rate X  push scans at X times the speed of the recording, loops closed beside; a scan that is due
+  while earlier ones wait is dropped (default: one after another, the same to the bit every time)
+--map DIR  a result or a place in whose map the robot is localized (default: map anew)
+--mode {{localise,extend}} = localise  whether the map of --map stays as it is, or grows
+--max-scratch GB  disk, about, that the beams of the drive may take: beyond, poses go on, but no
+  scan is kept (default: all are)
+--foxglove  serve map, scans, pose and path to Foxglove or Lichtblick on this machine, over a
+  WebSocket; needs the extra `live`
+--host ADDRESS  where --foxglove listens; who reaches it can watch (default: 127.0.0.1)
+--port N  port of --foxglove; 0: a free one (default: 8765)
+{NO_ODOMETRY}{PLACE_MAP}{RUN}{READ}{OTHERS}"""
+
+
 def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-
-    def add(flag: str, metavar: str | None, text: str, **more: Any) -> None:
-        if metavar is None and not more:
-            more = {"action": "store_true"}
-        elif metavar is not None:
-            more["metavar"] = metavar
-        p.add_argument(flag, help=text, **more)
-
-    add("--replay", "INPUT", "a recording (default: a ROS 2 node that maps until Ctrl-C)")
-    p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
-    add("--overwrite", None, "replace what is in DIR")
-    text = "push scans at X times the speed of the recording, loops closed beside; a scan that is "
-    text += "due while earlier ones wait is dropped (default: one after another, the same to the "
-    add("--rate", "X", text + "bit every time)", type=float)
-    text = "a result or a place in whose map the robot is localized (default: map anew)"
-    add("--map", "DIR", text)
-    text = "whether the map of --map stays as it is, or what is seen is added (default: localise)"
-    add("--mode", None, text, choices=("localise", "extend"), default="localise")
-    text = "disk, about, that the beams of the drive may take: beyond, poses go on, but no scan is "
-    add("--max-scratch", "GB", text + "kept (default: all are)", type=float)
-    add("--no-odometry", None, "ignore odometry in the recording")
-    text = "serve map, scans, pose and path to Foxglove or Lichtblick on this machine, over a "
-    add("--foxglove", None, text + "WebSocket; needs the extra `live`")
-    text = "where --foxglove listens; who reaches it can watch (default: 127.0.0.1)"
-    add("--host", "ADDRESS", text)
-    add("--port", "N", "port of --foxglove; 0: a free one (default: 8765)", type=int)
-    add_map_flags(p, whole=False)
-    for add_more in (add_run_flags, add_read_flags, add_option_flags):
-        add_more(p)
+    """Add what a table cannot say."""
     text = "of the node, up to the end"
     p.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], help=text)
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import (
-    add_flags,
-    add_map_flags,
-    add_method_flags,
-    add_option_flags,
-    add_read_flags,
-    add_run_flags,
+    METHOD,
+    OTHERS,
+    OVERWRITE,
+    READ,
+    RUN,
     options_from_args,
     require_apart,
 )
@@ -41,34 +40,16 @@ EPILOG = """examples:
 """
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    from stillmap.pipeline.options import DEFAULTS
-
-    p.add_argument(
-        "input",
-        metavar="INPUT",
-        nargs="+",
-        help="a CARMEN log, a ROS bag, a stillmap recording folder, ...; several: the parts of "
-        "one run, in any order",
-    )
-    p.add_argument(
-        "--tilting",
-        metavar="RECORDING",
-        help="recording of a tilting laser on the same robot, mapped in 3D: INPUT, of the planar "
-        "laser, decides what moves",
-    )
-    add_flags(p, {"--tilting-topic": "read.tilting_topic"}, DEFAULTS)
-    p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
-    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
-    p.add_argument(
-        "--resume", action="store_true", help="continue an interrupted run from its last checkpoint"
-    )
-    add_run_flags(p)
-    add_method_flags(p.add_argument_group("method"))
-    add_map_flags(p.add_argument_group("map"))
-    add_read_flags(p)
-    add_option_flags(p)
+FLAGS = f"""
+input INPUT+  a CARMEN log, a ROS bag, a stillmap recording folder, ...; several: the parts of one
+  run, in any order
+--tilting RECORDING  recording of a tilting laser on the same robot, mapped in 3D: INPUT, of the
+  planar laser, decides what moves
+--tilting-topic -> read.tilting_topic
+-o --output DIR!  result folder
+{OVERWRITE}
+--resume  continue an interrupted run from its last checkpoint
+{RUN}{METHOD}{READ}{OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import (
-    add_map_flags,
-    add_option_flags,
-    add_read_flags,
-    add_run_flags,
+    NO_ODOMETRY,
+    OTHERS,
+    OVERWRITE,
+    PLACE_MAP,
+    READ,
+    RUN,
     make_parents,
     options_from_args,
     require_apart,
@@ -37,33 +39,14 @@ exit status 2 where fewer than two sessions could be placed
 """
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument(
-        "input",
-        metavar="SESSION",
-        nargs="+",
-        help="a recording, a result folder, or first a place",
-    )
-    p.add_argument("-o", "--output", metavar="PLACE", required=True, help="folder of the place")
-    p.add_argument("--overwrite", action="store_true", help="replace what is in PLACE")
-    p.add_argument(
-        "--frame",
-        metavar="NAME",
-        help="session whose frame the place has (default: the first one, or as it was)",
-    )
-    p.add_argument(
-        "--map-state",
-        metavar="STATE",
-        default="last",
-        help="state of what changed that the map shows: last, majority, the name of a session, "
-        "or a date such as 2026-05-31 (default: last)",
-    )
-    add_map_flags(p, whole=False)
-    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in recordings")
-    add_run_flags(p)
-    add_read_flags(p)
-    add_option_flags(p)
+FLAGS = f"""
+input SESSION+  a recording, a result folder, or first a place
+-o --output PLACE!  folder of the place
+{OVERWRITE}
+--frame NAME  session whose frame the place has (default: the first one, or as it was)
+--map-state STATE = last  state of what changed that the map shows: last, majority, the name of a
+  session, or a date such as 2026-05-31
+{PLACE_MAP}{NO_ODOMETRY}{RUN}{READ}{OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
+from stillmap.cli.arguments import add_flags
 from stillmap.cli.console import colorize
 from stillmap.core.errors import closest_match, printable
 
@@ -150,7 +151,9 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
             command = commands.add_parser(
                 name, help=about, description=module.DESCRIPTION, epilog=module.EPILOG
             )
-            module.add_arguments(command)
+            add_flags(command, module.FLAGS)
+            if hasattr(module, "add_arguments"):
+                module.add_arguments(command)
             command.set_defaults(run=module.run)
         else:
             commands.add_parser(name, help=about)

@@ -1,12 +1,11 @@
 """`stillmap simulate SCENE`: simulate a recording with truth, for tests and demos."""
 
 import argparse
-import math
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import add_set_flag, make_parents
+from stillmap.cli.arguments import JSON, OVERWRITE, make_parents
 from stillmap.cli.console import list_files, print_json, say, show_share
 from stillmap.core.errors import InputError
 
@@ -43,97 +42,55 @@ examples:
   stillmap simulate office -o days --sessions 5 --seed 3
 """
 
-# flag, metavar, type, option that it sets, help
-_FLAGS: tuple[tuple[str, str, type, str, str], ...] = (
-    ("people", "N", int, "crowd.people", "number of people"),
-    ("stopping", "SHARE", float, "crowd.stopping_share", "share of people who stop at times"),
-    ("min-stop", "S", float, "crowd.min_stop", "shortest stop, seconds"),
-    ("max-stop", "S", float, "crowd.max_stop", "longest stop, seconds"),
-    ("shape", "SHAPE", str, "crowd.shape", "shape of people in a scan: legs, bodies or mixed"),
-    ("scans", "N", int, "robot.scans", "number of scans; the route is repeated"),
-    ("rate", "HZ", float, "robot.scan_rate", "scans per second"),
-    ("carried-at", "SHARE", float, "robot.carried_at", "when the robot is carried, 0 to 1"),
-    ("stamp-rounding", "S", float, "robot.stamp_rounding", "resolution of stamps, seconds"),
-    ("beams", "N", int, "laser.beams", "beams per scan"),
-    ("fov", "DEG", float, "laser.fov", "field of view in degrees"),
-    ("max-range", "M", float, "laser.max_range", "range of the laser, metres"),
-    ("range-noise", "M", float, "laser.range_noise", "standard deviation of ranges, metres"),
-    ("sweep-time", "S", float, "laser.sweep_time", "duration of a scan, seconds"),
-    ("slip-rate", "N", float, "odometry.slip_rate", "wheel slips per metre driven"),
-    ("stall-rate", "N", float, "odometry.stall_rate", "odometry stalls per minute"),
-    ("resets", "N", int, "odometry.resets", "number of resets of odometry to its origin"),
-)
+FLAGS = f"""
+scene SCENE  one of those listed below
+-o --output DIR!  folder for recording and truth
+{OVERWRITE}
+--sessions N  N recordings of the place on as many days: things are moved, brought and taken in
+  between, routes, starts and mounts differ
+--format {{stillmap,carmen}} = stillmap  a recording folder, or a CARMEN log, recording.log
+--seed N = 0  seed of the random numbers
+{JSON}
+people:
+--people N -> crowd.people  number of people
+--stopping P -> crowd.stopping_share  share of people who stop at times
+--min-stop S -> crowd.min_stop  shortest stop, seconds
+--max-stop S -> crowd.max_stop  longest stop, seconds
+--shape SHAPE -> crowd.shape  shape of people in a scan: legs, bodies or mixed
+
+robot:
+--scans N -> robot.scans  number of scans; the route is repeated
+--rate HZ -> robot.scan_rate  scans per second
+--carried-at P -> robot.carried_at  when the robot is carried, 0 to 1
+--stamp-rounding S -> robot.stamp_rounding  resolution of stamps, seconds
+
+laser:
+--beams N -> laser.beams  beams per scan
+--fov DEG -> laser.fov  field of view in degrees
+--max-range M -> laser.max_range  range of the laser, metres
+--range-noise M -> laser.range_noise  standard deviation of ranges, metres
+--sweep-time S -> laser.sweep_time  duration of a scan, seconds
+--second-laser -> laser.second_laser  a second laser that looks backwards
+--lidar N|tilting  a spinning lidar of N channels instead, in 3D; 'tilting': a second laser that
+  tilts
+--camera -> camera.enabled  cameras, with --lidar; their images show static and moving things
+
+odometry:
+--slip-rate X -> odometry.slip_rate  wheel slips per metre driven
+--stall-rate X -> odometry.stall_rate  odometry stalls per minute
+--resets N -> odometry.resets  number of resets of odometry to its origin
+--odometry-noise X = 1.0  factor on the default errors of odometry; 0: perfect
+
+any other option of the scene, see docs/simulation.md:
+--set SECTION.KEY=VALUE... -> assignments  e.g. traffic.vehicles=3; can be given again
+"""
 # options of the laser that a lidar has too, and its own
 _LIDAR_KEYS = (
     ("laser.max_range", "lidar.max_range"),
     ("laser.range_noise", "lidar.range_noise"),
     ("robot.scan_rate", "lidar.rate"),
 )
-_GROUPS = {"crowd": "people", "robot": "robot", "laser": "laser", "odometry": "odometry"}
 _NOISES = "wheel_radius_error wheel_base_error translation_noise rotation_noise drift_noise"
-
-
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument("scene", metavar="SCENE", help="one of those listed below")
-    p.add_argument(
-        "-o", "--output", metavar="DIR", required=True, help="folder for recording and truth"
-    )
-    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
-    p.add_argument(
-        "--sessions",
-        metavar="N",
-        type=int,
-        help="N recordings of the place on as many days: things are moved, brought and taken in "
-        "between, routes, starts and mounts differ",
-    )
-    p.add_argument(
-        "--format",
-        choices=("stillmap", "carmen"),
-        default="stillmap",
-        help="a recording folder, or a CARMEN log, recording.log (default: %(default)s)",
-    )
-    p.add_argument(
-        "--seed", metavar="N", type=int, default=0, help="seed of the random numbers (default: 0)"
-    )
-    p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
-    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    groups = {section: p.add_argument_group(title) for section, title in _GROUPS.items()}
-    for flag, metavar, kind, name, text in _FLAGS:
-        group = groups[name.partition(".")[0]]
-        group.add_argument(f"--{flag}", metavar=metavar, type=kind, dest=name, help=text)
-    _add_sensor_flags(groups["laser"])
-    groups["odometry"].add_argument(
-        "--odometry-noise",
-        metavar="FACTOR",
-        type=float,
-        default=1.0,
-        help="factor on the default errors of odometry; 0: perfect (default: %(default)g)",
-    )
-    others = p.add_argument_group("any other option of the scene, see docs/simulation.md")
-    add_set_flag(others, "e.g. traffic.vehicles=3; can be given again")
-
-
-def _add_sensor_flags(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--second-laser",
-        action="store_const",
-        const=True,
-        dest="laser.second_laser",
-        help="a second laser that looks backwards",
-    )
-    group.add_argument(
-        "--lidar",
-        metavar="N",
-        help="a spinning lidar of N channels instead, in 3D; 'tilting': a second laser that tilts",
-    )
-    group.add_argument(
-        "--camera",
-        action="store_const",
-        const=True,
-        dest="camera.enabled",
-        help="cameras, with --lidar; their images show static and moving things",
-    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -208,10 +165,8 @@ def _flag_changes(args: argparse.Namespace) -> dict[str, Any]:
     """Options that flags set, by name."""
     from stillmap.sim import scene_by_name
 
-    changes = {name: value for name, value in vars(args).items() if "." in name}
-    changes = {name: value for name, value in changes.items() if value is not None}
-    if "laser.fov" in changes:
-        changes["laser.fov"] = math.radians(changes["laser.fov"])
+    given = {name: value for name, value in vars(args).items() if "." in name}
+    changes = {name: value for name, value in given.items() if value not in (None, False)}
     if args.odometry_noise != 1.0:
         usual = scene_by_name(args.scene).odometry
         for key in _NOISES.split():

@@ -38,16 +38,14 @@ EPILOG = """examples:
 """
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Add the flags and arguments."""
-    p.add_argument("result", metavar="DIR", help="folder that `stillmap map` or `merge` wrote")
-    p.add_argument("--report", action="store_true", help="open the report instead")
-    p.add_argument("--print", action="store_true", help="print the path of the report")
-    p.add_argument(
-        "--port", type=int, metavar="N", default=0, help="port of the page (default: a free one)"
-    )
-    p.add_argument("--input", metavar="FILE", help="the recording, if it was moved")
-    p.add_argument("--no-beams", action="store_true", help="do not read the recording")
+FLAGS = """
+result DIR  folder that `stillmap map` or `merge` wrote
+--report  open the report instead
+--print  print the path of the report
+--port N = 0  port of the page; 0: a free one
+--input FILE  the recording, if it was moved
+--no-beams  do not read the recording
+"""
 
 
 def run(args: argparse.Namespace) -> int:
