@@ -1,6 +1,5 @@
 """`stillmap info`: text and JSON."""
 
-import argparse
 import json
 import re
 from dataclasses import replace
@@ -10,8 +9,8 @@ import pytest
 from PIL import Image
 from recordings import of_one_sensor
 
-from stillmap.cli import info
 from stillmap.cli import recording_info as module
+from stillmap.cli.parser import parser
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -36,9 +35,8 @@ def path(tmp_path):
 
 
 def run(*arguments):
-    parser = argparse.ArgumentParser()
-    info.add_arguments(parser)
-    return info.run(parser.parse_args([*map(str, arguments)]))
+    args = parser(["info"]).parse_args(["info", *map(str, arguments)])
+    return args.run(args)
 
 
 def test_json(path, capsys):

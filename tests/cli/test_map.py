@@ -77,7 +77,7 @@ def test_progress_lines_without_terminal(mapped):
     assert done.stdout == ""
     lines = done.stderr.splitlines()
     assert all(line.startswith("stillmap: ") for line in lines)
-    assert sum("iteration 1 of at most 2" in line for line in lines) == 1
+    assert sum("iteration 1/2" in line for line in lines) == 1
     assert re.search(r"40 of 40 scans, \d+/s", done.stderr)
     assert "\x1b" not in done.stderr
     assert "\r" not in done.stderr

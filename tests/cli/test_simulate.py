@@ -1,6 +1,5 @@
 """`stillmap simulate`: flags, refusals, readable output."""
 
-import argparse
 import json
 import math
 from pathlib import Path
@@ -10,7 +9,7 @@ import pytest
 from place_truth import load_session_truth
 
 from stillmap import io
-from stillmap.cli import simulate
+from stillmap.cli.parser import parser
 from stillmap.core.errors import InputError
 from stillmap.sim import load_truth
 
@@ -18,9 +17,8 @@ QUICK = ("--scans", "20", "--beams", "90", "--people", "3")
 
 
 def call(*words: str) -> int:
-    parser = argparse.ArgumentParser()
-    simulate.add_arguments(parser)
-    return simulate.run(parser.parse_args(words))
+    args = parser(["simulate"]).parse_args(["simulate", *words])
+    return args.run(args)
 
 
 def test_recording_reads_back_with_truth(tmp_path: Path) -> None:
@@ -94,27 +92,17 @@ def test_flags_reach_the_scene(tmp_path: Path) -> None:
 
 
 def test_any_option_can_be_set_and_flags_win(tmp_path: Path) -> None:
-    sets = "--set laser.yaw=0.5 --set laser.beams=7 --set odometry.slip_length=2"
-    call("hall", "-o", str(tmp_path / "sim"), *QUICK, *sets.split())
-    scene = load_truth(tmp_path / "sim").scene
+    words = "--set laser.yaw=0.5 --set laser.beams=7 --set odometry.slip_length=2"
+    words += " --set laser.upside_down=unknown --second-laser --sweep-time 0.1 --people 0"
+    call("hall", "-o", str(tmp_path / "sim"), *QUICK, *words.split())
+    scene, read = load_truth(tmp_path / "sim").scene, io.read(tmp_path / "sim")
     assert (scene["laser"]["yaw"], scene["laser"]["beams"]) == (0.5, 90)
     assert scene["odometry"]["slip_length"] == 2.0
-
-
-def test_sweep_time_gives_beam_times(tmp_path: Path) -> None:
-    call("hall", "-o", str(tmp_path / "sim"), *QUICK, "--sweep-time", "0.1")
-    times = io.read(tmp_path / "sim").beam_time
-    assert times is not None
-    assert 0.09 < np.ptp(times) < 0.1
-
-
-def test_second_and_upside_down_laser(tmp_path: Path) -> None:
-    flags = ("--second-laser", "--set", "laser.upside_down=unknown")
-    call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags)
-    read = io.read(tmp_path / "sim")
+    assert scene["laser"]["upside_down"] == "unknown"
+    assert scene["crowd"]["people"] == 0
+    assert 0.09 < np.ptp(read.beam_time) < 0.1
     assert read.sensor.tolist() == [0, 1] * 10
     assert len(read.T_base_sensor) == 2
-    assert load_truth(tmp_path / "sim").scene["laser"]["upside_down"] == "unknown"
 
 
 def test_a_lidar_records_in_3d(tmp_path: Path) -> None:

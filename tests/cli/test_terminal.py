@@ -6,12 +6,9 @@ import re
 import pytest
 from maps import ENDLESS
 
-from stillmap.cli.console import (
-    colorize,
-    show_progress,
-    show_share,
-    uses_color,
-)
+from stillmap.cli import console
+from stillmap.cli.console import colorize, show_progress, show_share, uses_color
+from stillmap.core import profiling
 
 VARIABLES = ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TERM")
 RED, PLAIN = "\x1b[1;31m", "\x1b[0m"
@@ -62,20 +59,10 @@ def test_errors_are_red_on_a_terminal(on_a_terminal, words, prefix):
 
 def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     words = ("map", room, "--no-odometry", "--set", "em.max_iterations=1")
-    _, written = on_a_terminal(*words, "-o", tmp_path / "a")
-    assert "\x1b" in written
     _, written = on_a_terminal(*words, "-o", tmp_path / "b", TERM="dumb")
     assert "\x1b" not in written
     assert "stillmap: note: no odometry" in written
-    assert "stillmap: matching scans, iteration 1" in written
-
-
-def test_log_messages_appear_above_the_bar(on_a_terminal, room, tmp_path):
-    words = ("-v", "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=1")
-    status, written = on_a_terminal(*words)
-    assert status == 0
-    lines = [line.rpartition("\x1b[2K")[2] for line in written.splitlines()]
-    assert any(line.startswith("stillmap: iteration 1: bound") for line in lines), lines
+    assert "stillmap: matching scans, iteration 1/1" in written
 
 
 def left_on_screen(written: str) -> list[str]:
@@ -98,32 +85,30 @@ def left_on_screen(written: str) -> list[str]:
     return [line for line in lines if line.strip()]
 
 
-def test_bar_is_removed_at_the_end(on_a_terminal, room, tmp_path):
-    status, written = on_a_terminal(
-        "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
-    )
+def test_bar_below_log_messages_is_removed_at_the_end(on_a_terminal, room, tmp_path):
+    words = ("-v", "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2")
+    status, written = on_a_terminal(*words)
     assert status == 0
-    assert "iteration 1 of at most 2" in written
+    assert "iteration 1/2" in written
     assert "/40" in written
     assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0  # the cursor came back
     lines = left_on_screen(written)
     assert all(line.startswith("stillmap: ") for line in lines), lines
+    assert any(line.startswith("stillmap: iteration 1: bound") for line in lines), lines
     assert "report.html" in lines[-2]
 
 
-@pytest.mark.parametrize("columns", [50, 80, 100, 120])
+@pytest.mark.parametrize("columns", [80, 120])
 def test_progress_fits_the_terminal(monkeypatch, columns):
     written = Terminal()
     monkeypatch.setattr("sys.stderr", written)
     monkeypatch.setenv("COLUMNS", str(columns))
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
-    steps = (("matching scans", 2), ("modelling moving objects", 0), ("removing moving objects", 0))
     with show_share(False, "reading") as share:
-        assert share is not None
         share(0.5)
     with show_progress(False, 6) as progress:
-        for what, iteration in steps:
+        for what, iteration in (("matching scans", 2), ("modelling moving objects", 0)):
             for done in (1, 654321, 987654):
                 progress(what, iteration, done, 987654)
     shown = re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", written.getvalue())
@@ -131,6 +116,44 @@ def test_progress_fits_the_terminal(monkeypatch, columns):
     assert "…" not in shown  # of texts that are cut off
     for text in ("reading", "50 %", "matching scans", "modelling moving objects", "987654/987654"):
         assert text in shown
+
+
+@pytest.fixture
+def lines(monkeypatch):
+    """The lines that are printed where there is no terminal."""
+    printed = []
+    monkeypatch.setattr(console, "say", printed.append)
+    monkeypatch.setattr(profiling, "is_terminal", lambda _: False)
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    return printed
+
+
+def test_lines_of_long_steps(lines, monkeypatch):
+    monkeypatch.setattr(profiling, "_LINE_PERIOD", 0.0)
+    with console.show_progress(False, 6) as progress:
+        progress("matching scans", 1, 20, 80)
+        progress("choosing pictures", 0, 3, 12)
+        progress("labelling beams", 1, 0, 0)
+    with show_share(False, "reading") as share:
+        share(0.5)
+    with console.show_progress(True, 3) as progress:
+        progress("unheard", 1, 3, 3)
+    assert re.fullmatch(
+        r"matching scans, iteration 1/6: 20 of 80 scans, \d+/s, \d+ s left", lines[0]
+    )
+    assert re.fullmatch(r"choosing pictures: 3 of 12, \d+ s left", lines[1])
+    assert lines[2:] == ["labelling beams, iteration 1/6: begins", "reading: 50 %"]
+
+
+def test_short_iteration_is_reported_once(lines):
+    with console.show_progress(False, 3) as progress:
+        for iteration in (1, 2):
+            for what in ("matching scans", "refining poses"):
+                for done in range(1, 4):
+                    progress(what, iteration, done, 3)
+            progress("labelling beams", iteration, 0, 0)
+    starts = [line.partition(": 3 of 3 scans")[0] for line in lines]
+    assert starts == [f"matching scans, iteration {k}/3" for k in (1, 2)]
 
 
 def test_ctrl_c_before_anything_is_finished(call, room, tmp_path, nothing_left, monkeypatch):

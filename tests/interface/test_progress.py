@@ -22,7 +22,7 @@ def test_a_bar_on_stderr(folder, capfd, monkeypatch):
     stillmap.build(folder, FAST, resolution=0.2, progress=True)
     out, err = capfd.readouterr()
     assert out == ""
-    assert "matching scans 1/2" in err
+    assert "matching scans, iteration 1/2" in err
 
 
 def test_a_function_is_told(folder):

@@ -122,9 +122,8 @@ def _settings(row: re.Match[str]) -> dict[str, Any]:
         return settings | _settings_of_option(row["dest"])
     settings["help"] = row["help"]
     if row["takes"] is None:
-        value = row["value"]
-        const, default = (True, False) if value is None else (value, None)
-        return settings | {"action": "store_const", "const": const, "default": default}
+        settings["default"] = None if row["dest"] else False  # options stay as they are
+        return settings | {"action": "store_const", "const": row["value"] or True}
     words, nargs = row["takes"].split(), row["nargs"]
     settings["type"] = _TYPES.get(row["takes"], str) if len(words) == 1 else float
     if row["takes"].startswith("{"):
@@ -226,13 +225,10 @@ def make_parents(output: Path) -> Iterator[None]:
     from stillmap.core.files import resolve_output, temporary_folder
 
     parent = resolve_output(output).parent
-    created: list[Path] = []
+    created = [folder for folder in (parent, *parent.parents) if not folder.exists()]
     try:
         try:
-            for folder in reversed((parent, *parent.parents)):
-                if not folder.exists():
-                    created.append(folder)  # an interruption right after it was made finds it
-                    folder.mkdir(exist_ok=True)
+            parent.mkdir(parents=True, exist_ok=True)
             # the writer reports a device at this path
             if not output.exists() or output.is_file() or output.is_dir():
                 with temporary_folder(output):
@@ -242,7 +238,7 @@ def make_parents(output: Path) -> Iterator[None]:
         yield
     except BaseException:
         with suppress(OSError):  # not empty
-            for folder in reversed(created):
+            for folder in created:
                 folder.rmdir()
         raise
 

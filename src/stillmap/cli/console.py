@@ -1,6 +1,7 @@
 """Messages and progress on stderr, text and JSON on stdout, and signals."""
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,7 +13,7 @@ from typing import IO, Any
 from stillmap.core import profiling
 from stillmap.core.errors import InputError, printable
 from stillmap.core.interrupts import defers_signals_in, send_again
-from stillmap.core.profiling import Progress, is_terminal
+from stillmap.core.profiling import Progress, Show, is_terminal
 
 _UNITS = ("m", "s", "ns", "deg", "hz")  # at the end of keys
 _EMPTY: tuple[Any, ...] = (None, "", [], {}, ())
@@ -61,35 +62,27 @@ def write_line(line: str) -> None:
 
 
 @contextmanager
+def show_steps(quiet: bool) -> Iterator[Show]:
+    """A function that shows a step, and how much of it is done; see `core.profiling.Show`."""
+    if quiet or sys.stderr is None:  # None: closed before the start
+        yield lambda *_: None
+    else:
+        with profiling.show_steps(say) as show:
+            yield show
+
+
+@contextmanager
 def show_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
     """A Progress that shows step, iteration, scans, rate and time left; nothing if quiet."""
-    if quiet or sys.stderr is None:  # None: closed before the start
-        yield profiling.no_progress
-    else:
-        with profiling.show_progress(iterations, say) as progress:
-            yield progress
+    with show_steps(quiet) as show:
+        yield profiling.show_iterations(show, iterations)
 
 
 @contextmanager
-def show_share(quiet: bool, what: str) -> Iterator[Callable[[float], None] | None]:
-    """A function that shows the share of a job that is done, 0 to 1; None if quiet."""
-    if quiet or sys.stderr is None:
-        yield None
-    else:
-        with profiling.show_steps(say) as show:
-            yield lambda share: show(what, float(share), 1.0)
-
-
-@contextmanager
-def show_tasks(quiet: bool) -> Iterator[Callable[[str, int, int, str], None]]:
-    """A function that shows what is done, how many of how many tasks, and the last one's name."""
-    if quiet or sys.stderr is None:
-        yield lambda *_: None
-    elif is_terminal(sys.stderr):
-        with profiling.show_steps(say) as show:
-            yield lambda what, done, total, name: show(what, done, total)  # noqa: ARG005
-    else:
-        yield lambda what, done, total, name: say(f"{what}: {done} of {total}, {name}")
+def show_share(quiet: bool, what: str) -> Iterator[Callable[[float], None]]:
+    """A function that shows the share of a job that is done, 0 to 1; nothing if quiet."""
+    with show_steps(quiet) as show:
+        yield lambda share: show(what, float(share), 1.0)
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -209,26 +202,17 @@ def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
     return False
 
 
-# argument, as hints of Python name it -> flag
-_IN_HINTS = {
-    "overwrite=True": "--overwrite",
-    "resume=True": "--resume",
-    "recording=PATH": "--input",
-    "max_dt=SECONDS": "--max-dt",
-    "port=0 takes any free one": "without --port any free one is used",
-    "name=FORMAT": "--to",
-    "frame=": "--frame ",
-    "map_state=": "--map-state ",
-    "tilting=": "--tilting ",
-    "estimator=": "--estimator ",
-    'poses="FILE.tum"': "--poses FILE.tum",
-    'poses="recording"': "--poses recording",
-}
+_ARGUMENT = re.compile(r"(?<![\w.])([a-z_]+)=(True\b|False\b|(?=\S))")  # in a hint for Python
+_FLAGS = {"recording": "input", "name": "to"}  # of arguments with another name
 
 
 def in_flags(error: InputError) -> InputError:
     """The error with flags in its hint instead of arguments."""
-    hint = error.hint
-    for argument, flag in _IN_HINTS.items():
-        hint = hint.replace(argument, flag)
+
+    def to_flag(argument: re.Match[str]) -> str:
+        flag = _FLAGS.get(argument[1], argument[1]).replace("_", "-")
+        ends = {"True": f"--{flag}", "False": f"--no-{flag}", "": f"--{flag} "}
+        return ends[argument[2]]
+
+    hint = _ARGUMENT.sub(to_flag, error.hint)
     return InputError(error.what, where=error.where, hint=hint)

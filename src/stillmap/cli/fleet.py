@@ -4,14 +4,14 @@ import argparse
 import json
 import os
 import shlex
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import METHOD, OTHERS, READ, options_from_args
-from stillmap.cli.console import fail, print_json, say, show_tasks
+from stillmap.cli.console import fail, print_json, say, show_steps
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
+    from stillmap.core.profiling import Show
     from stillmap.fleet import Fleet, Request
     from stillmap.fleet.inputs import Entry
     from stillmap.pipeline.options import Options
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.fleet import run_fleet
 
     try:
-        with show_tasks(args.quiet) as progress:
+        with show_steps(args.quiet) as progress:
             fleet = run_fleet(_read_request(args, progress))
     except (KeyboardInterrupt, SystemExit):
         if not args.quiet:
@@ -80,9 +80,7 @@ def run_command(words: list[str]) -> None:
     args.run(args)
 
 
-def _read_request(
-    args: argparse.Namespace, progress: Callable[[str, int, int, str], None]
-) -> "Request":
+def _read_request(args: argparse.Namespace, progress: Show) -> "Request":
     from stillmap.core.parallel import resolve_threads
     from stillmap.fleet import Request
 

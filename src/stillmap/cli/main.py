@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 from stillmap.cli.console import (
     EXIT_INTERRUPTED,
@@ -20,7 +19,6 @@ from stillmap.cli.console import (
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import (
     InputError,
-    closest_match,
     is_out_of_memory,
     memory_error,
     printable,
@@ -28,14 +26,11 @@ from stillmap.core.errors import (
 
 EXIT_DEFECT = 1
 
-_MAX_NAMES = 10_000  # of a folder that are compared with a missing file's name
-
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # file names need not be valid UTF-8
         sys.stdout.reconfigure(errors="backslashreplace")
-    args = argparse.Namespace()
     try:
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
@@ -45,12 +40,12 @@ def main(argv: list[str] | None = None) -> int:
             sys.stdout.flush()
         return status
     except Exception as error:
-        return _report_failure(error, args)
+        return _report_failure(error)
     except KeyboardInterrupt:
         return _report_interrupt()
 
 
-def _report_failure(error: Exception, args: argparse.Namespace) -> int:
+def _report_failure(error: Exception) -> int:
     """Print why the command failed; the exit status."""
     # a clean-up may fail, too, as on a terminal that has gone
     error = memory_error(error) if is_out_of_memory(error) else error
@@ -58,7 +53,7 @@ def _report_failure(error: Exception, args: argparse.Namespace) -> int:
     if cause is not None:
         return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
     if isinstance(error, InputError):
-        fail(str(in_flags(_with_similar_name(error, args))))
+        fail(str(in_flags(error)))
     elif isinstance(error, BrokenPipeError):
         # the reader of stdout has closed it: not an error
         _drop_stdout()
@@ -99,39 +94,12 @@ def _set_up_logging(args: argparse.Namespace) -> None:
         root.addHandler(_Handler())
 
 
-def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputError:
-    """Add a hint to the error of a missing file: the file beside it with a similar name."""
-    path = Path(error.where)
-    words = [word for value in vars(args).values() for word in _as_list(value)]
-    given = {Path(word) for word in words if isinstance(word, str | Path)}
-    if not error.what.startswith(("does not exist", "cannot be read")) or path not in given:
-        return error
-    try:
-        if os.path.lexists(path) or not path.parent.is_dir():
-            return error
-        with os.scandir(path.parent) as entries:
-            names = [entry.name for entry, _ in zip(entries, range(_MAX_NAMES), strict=False)]
-    except (OSError, ValueError):
-        return error
-    similar = closest_match(path.name, names)
-    if similar is None:
-        return error
-    hint = f"did you mean '{path.with_name(similar)}'?"
-    return InputError(error.what, where=error.where, hint=hint)
-
-
-def _as_list(value: object) -> list[object]:
-    """The values of an argument that takes several, or its only one."""
-    return list(value) if isinstance(value, list) else [value]
-
-
 def _report_defect(error: Exception) -> None:
     """Print the trace and ask for a report."""
     import traceback
 
-    for lines in traceback.format_exception(error):
-        for line in lines.rstrip("\n").split("\n"):
-            write_line(printable(line))
+    for line in "".join(traceback.format_exception(error)).splitlines():
+        write_line(printable(line))
     fail("this is a defect of stillmap: please report it, with the lines above")
 
 

@@ -68,16 +68,6 @@ class Parser(argparse.ArgumentParser):
             sys.stdout.flush()
         super().exit(status, message)
 
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        if action.choices is None or value in action.choices:
-            return
-        choices = [str(one) for one in action.choices]
-        if isinstance(action, argparse._SubParsersAction):
-            self.error(f"unknown {str(action.metavar).lower()} '{value}'", _suggest(value, choices))
-        name = argparse.ArgumentError(action, "").argument_name
-        what = f"argument {name}: invalid choice: '{value}' (choose from {', '.join(choices)})"
-        self.error(what, _suggest(str(value), choices))
-
     def _reject(self, unknown: list[str]) -> None:
         if unknown:
             flag = unknown[0].partition("=")[0]

@@ -165,8 +165,8 @@ def _flag_changes(args: argparse.Namespace) -> dict[str, Any]:
     """Options that flags set, by name."""
     from stillmap.sim import scene_by_name
 
-    given = {name: value for name, value in vars(args).items() if "." in name}
-    changes = {name: value for name, value in given.items() if value not in (None, False)}
+    changes = {name: value for name, value in vars(args).items() if "." in name}
+    changes = {name: value for name, value in changes.items() if value is not None}
     if args.odometry_noise != 1.0:
         usual = scene_by_name(args.scene).odometry
         for key in _NOISES.split():

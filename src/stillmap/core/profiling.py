@@ -2,9 +2,7 @@
 
 import os
 import resource
-import shutil
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -15,7 +13,7 @@ from typing import IO, Any, Protocol
 Progress = Callable[[str, int, int, int], None]
 
 _LINE_PERIOD = 10.0  # s between lines of progress without a terminal
-_WIDE = 100  # columns of a terminal: from there on with longer texts
+_STAGE = ("seconds", "cpu_seconds", "peak_memory_bytes")
 
 
 class Show(Protocol):
@@ -41,19 +39,20 @@ class StageTimer:
         try:
             yield
         finally:
-            stage = self._stages.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
-            stage["seconds"] += time.perf_counter() - started
-            stage["cpu_seconds"] += time.process_time() - cpu  # of all threads
-            stage["peak_memory_bytes"] = peak_memory_bytes()
+            seconds = time.perf_counter() - started
+            self._add(name, seconds, time.process_time() - cpu, peak_memory_bytes())
 
     def add(self, earlier: Mapping[str, Mapping[str, Any]]) -> None:
         """Add the stages of the run that this one resumes, as `to_dict` returned them."""
         for name, before in earlier.items():
-            stage = self._stages.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
-            stage["seconds"] += before["seconds"]
-            stage["cpu_seconds"] += before["cpu_seconds"]
-            known = stage.get("peak_memory_bytes", 0)
-            stage["peak_memory_bytes"] = max(known, before["peak_memory_bytes"])
+            self._add(name, *(before[key] for key in _STAGE))
+
+    def _add(self, name: str, seconds: float, cpu_seconds: float, peak_memory: int) -> None:
+        """Add to a stage; CPU time is that of all threads."""
+        stage = self._stages.setdefault(name, dict.fromkeys(_STAGE, 0))
+        stage["seconds"] += seconds
+        stage["cpu_seconds"] += cpu_seconds
+        stage["peak_memory_bytes"] = max(stage["peak_memory_bytes"], peak_memory)
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
         """`seconds`, `cpu_seconds` and `peak_memory_bytes` (of the process so far) by stage."""
@@ -71,46 +70,31 @@ def is_terminal(stream: IO[str] | None) -> bool:
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
-def _shows_bar() -> bool:
-    return is_terminal(sys.stderr) or bool(os.environ.get("FORCE_COLOR"))
-
-
 def print_line(line: str) -> None:
     """Print a line to stderr."""
     print(line, file=sys.stderr, flush=True)
 
 
-@contextmanager
-def show_progress(iterations: int, say: Callable[[str], None] = print_line) -> Iterator[Progress]:
-    """A Progress that shows step, iteration, scans, rate and time left.
+def show_iterations(show: Show, iterations: int) -> Progress:
+    """A Progress that shows steps, of EM with its iteration, of at most so many."""
 
-    Args:
-        iterations: of EM, at most.
-        say: prints a line where stderr is no terminal.
-    """
-    is_wide = not _shows_bar() or shutil.get_terminal_size().columns >= _WIDE
-    with show_steps(say) as show:
+    def progress(what: str, iteration: int, done: int, total: int) -> None:
+        if iteration:
+            show(f"{what}, iteration {iteration}/{iterations}", done, total, "scans")
+        else:
+            show(what, done, total)
 
-        def progress(what: str, iteration: int, done: int, total: int) -> None:
-            name = what
-            if iteration and is_wide:
-                name += f", iteration {iteration} of at most {iterations}"
-            elif iteration:
-                name += f" {iteration}/{iterations}"
-            show(name, done, total, "scans" if iteration else "")
-
-        yield progress
+    return progress
 
 
 @contextmanager
 def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
-    """Show steps on stderr: by a bar on a terminal, elsewhere by a line now and then."""
-    if _shows_bar():
+    """Show steps on stderr: by a bar on a terminal, elsewhere by a line that `say` prints."""
+    if is_terminal(sys.stderr) or os.environ.get("FORCE_COLOR"):
         with _show_bar() as show:
             yield show
     else:
-        with _Lines(say) as lines:
-            yield lines.update
+        yield _Lines(say).update
 
 
 @contextmanager
@@ -153,48 +137,35 @@ def _show_bar() -> Iterator[Show]:
 
 
 class _Lines:
-    """Print progress every `_LINE_PERIOD` seconds, and once when scans of a new iteration end."""
+    """Prints progress every `_LINE_PERIOD` seconds, and once when scans of an iteration end."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._now: tuple[str, float, float, str] = ("preparing", 0, 0, "")
-        self._started, self._ended = time.monotonic(), ""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> "_Lines":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
+        self._step = self._ended = ""
+        self._started = self._printed = time.monotonic()
 
     def update(self, step: str, done: float, total: float, unit: str = "") -> None:
-        if step != self._now[0]:
-            self._started = time.monotonic()
-        self._now = step, done, total, unit
+        now = time.monotonic()
+        if step != self._step:
+            self._step, self._started = step, now
         iteration = step.rpartition(",")[2]
-        if unit == "scans" and 0 < total == done and iteration != self._ended:
-            self._ended = iteration
-            self._report()
+        is_end = unit == "scans" and 0 < total == done and iteration != self._ended
+        if is_end or now - self._printed >= _LINE_PERIOD:
+            self._printed = now
+            self._ended = iteration if is_end else self._ended
+            self._say(f"{step}: {_describe(done, total, unit, now - self._started)}")
 
-    def _run(self) -> None:
-        while not self._stop.wait(_LINE_PERIOD):
-            self._report()
 
-    def _report(self) -> None:
-        (step, done, total, unit), seconds = self._now, time.monotonic() - self._started
-        if not total:
-            text = f"{seconds:.0f} s so far"
-        elif isinstance(done, float):
-            text = f"{100.0 * done:.0f} %"
-        else:
-            rate = done / max(seconds, 1e-3)
-            text = f"{done} of {total} {unit}, {rate:.0f}/s" if unit else f"{done} of {total}"
-            if done < total:
-                text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
-        self._say(f"{step}: {text}")
+def _describe(done: float, total: float, unit: str, seconds: float) -> str:
+    """How far a step is, in words."""
+    if not total:
+        return "begins"
+    if isinstance(done, float):
+        return f"{100.0 * done:.0f} %"
+    rate = done / max(seconds, 1e-3)
+    text = f"{done} of {total} {unit}, {rate:.0f}/s" if unit else f"{done} of {total}"
+    left = f", {(total - done) / max(rate, 1e-3):.0f} s left" if done < total else ""
+    return text + left
 
 
 def reset_peak_memory() -> None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
+from stillmap.core.profiling import Show
 from stillmap.fleet.inputs import Entry, Source
 
 _FACTS = ("scans", "beams", "duration_s", "bytes")  # in `fleet.json`
@@ -21,14 +22,14 @@ class Request(NamedTuple):
         jobs: local processes at once.
         scheduler: address of a Dask scheduler; empty: local processes.
         fail: takes a line about a recording or a place that failed.
-        progress: takes what is done, how many of how many have ended, and the name of the last one.
+        progress: takes what is done, and how many of how many have ended.
     """
 
     entries: Sequence[Entry]
     output: str
     command: Callable[[list[str]], None]
     fail: Callable[[str], None]
-    progress: Callable[[str, int, int, str], None]
+    progress: Show
     map_flags: tuple[str, ...] = ()
     merge_flags: tuple[str, ...] = ()
     jobs: int = 1

@@ -200,7 +200,7 @@ def _run_tasks(client: Any, tasks: Sequence[Task], request: Request) -> dict[str
         if not outcome.is_done:
             request.fail(f"{'place ' * (task.command == 'merge')}{task.name}: {outcome.why}")
         what = "mapping" if task.command == "map" else "merging"
-        request.progress(what, len(outcomes), len(tasks), task.name)
+        request.progress(what, len(outcomes), len(tasks))
     return outcomes
 
 

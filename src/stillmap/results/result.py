@@ -16,7 +16,7 @@ from stillmap.core import config
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
 from stillmap.core.input_files import copy_file
-from stillmap.core.profiling import Progress, StageTimer, no_progress, show_progress
+from stillmap.core.profiling import Progress, StageTimer, no_progress, show_iterations, show_steps
 from stillmap.core.recording import Recording
 from stillmap.pipeline import inputs
 from stillmap.pipeline.options import DEFAULTS, Options
@@ -269,8 +269,8 @@ def report_to(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
     if callable(progress):
         yield progress
     elif progress:
-        with show_progress(iterations) as bar:
-            yield bar
+        with show_steps() as show:
+            yield show_iterations(show, iterations)
     else:
         yield no_progress
 
