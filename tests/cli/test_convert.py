@@ -100,7 +100,7 @@ def test_unwritable_output_is_named(call, room, tmp_path, monkeypatch):
     def denied(*_, **__):
         raise PermissionError(13, "Permission denied", f"{tmp_path}/rhh5gxx6.part")
 
-    monkeypatch.setattr("stillmap.core.files._held", denied)
+    monkeypatch.setattr("stillmap.core.files.temporary_folder", denied)
     for name in ("x.log", "new/x.log"):
         done = call("convert", room, "-o", tmp_path / name)
         refused(done, f"{tmp_path / name}: cannot be written: Permission denied")

@@ -80,7 +80,7 @@ def run_command(words: list[str]) -> None:
     args.run(args)
 
 
-def _read_request(args: argparse.Namespace, progress: Show) -> "Request":
+def _read_request(args: argparse.Namespace, progress: "Show") -> "Request":
     from stillmap.core.parallel import resolve_threads
     from stillmap.fleet import Request
 

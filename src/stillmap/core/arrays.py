@@ -21,17 +21,10 @@ from numpy.typing import DTypeLike, NDArray
 def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
     """Write named arrays. Equal arrays give equal files: dates in the archive are fixed."""
     # maps compress to a tenth; levels above 1 take three times as long for a few percent
-    with path.open("wb") as whole:
-        archive = zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
-        try:
-            for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                    _write_array(file, array)
-        except BaseException:
-            # close() would fail on the half-written array and hide the error
-            archive.fp = None
-            raise
-        archive.close()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                _write_array(file, array)
 
 
 def _write_array(file: Any, array: "Writable") -> None:
@@ -239,7 +232,6 @@ def unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[n
 Array = NDArray[Any]
 
 _WRITTEN_AT_ONCE = 1 << 20  # bytes at most in memory, once there is a file
-_SMALL_PARTS = 256  # appended rows that become one array
 
 
 class ArrayBuilder:
@@ -255,11 +247,8 @@ class ArrayBuilder:
         self, dtype: DTypeLike, row: tuple[int, ...] = (), folder: Path | None = None
     ) -> None:
         self._dtype, self._row, self._folder = np.dtype(dtype), row, folder
-        # in memory, as bytes: arrays of structures take long to join; the first ones are large
-        self._parts: list[NDArray[np.uint8]] = []
-        self._large, self._bytes, self._length = 0, 0, 0
+        self._buffer, self._written, self._length = bytearray(), 0, 0  # bytes in memory, in file
         self._file: IO[bytes] | None = None
-        self._is_closed = False
 
     def __len__(self) -> int:
         return self._length
@@ -269,37 +258,28 @@ class ArrayBuilder:
 
         Raises:
             OSError: the disk is full.
-            ValueError: the rows have another shape, or the builder is closed.
+            ValueError: the rows have another shape.
         """
-        self._require_open()
-        rows = np.array(rows, self._dtype, order="C", ndmin=1)
+        rows = np.asarray(rows, self._dtype, order="C")
         if rows.shape[1:] != self._row:
             raise ValueError(f"rows: expected (n, *{self._row}), got {rows.shape}")
-        if not len(rows):
-            return
         self._length += len(rows)
-        self._parts.append(rows.reshape(-1).view(np.uint8))
-        self._bytes += rows.nbytes
-        if len(self._parts) - self._large >= _SMALL_PARTS:
-            self._parts[self._large :] = [np.concatenate(self._parts[self._large :])]
-            self._large = len(self._parts)
+        self._buffer += rows.reshape(-1).view(np.uint8).data
         limit = MAX_BYTES_IN_MEMORY
-        if self._bytes > (limit if self._file is None else min(limit, _WRITTEN_AT_ONCE)):
+        if len(self._buffer) > (limit if self._file is None else min(limit, _WRITTEN_AT_ONCE)):
             self._write()
 
     def _write(self) -> None:
         """Write the rows that are in memory."""
         if self._file is None:
             self._file = open_unlinked(self._folder)
-        for part in self._parts:
-            left = part.data
-            while len(left):  # past the buffer, which could not be emptied on a full disk
-                left = left[os.write(self._file.fileno(), left) :]
-        self._parts, self._large, self._bytes = [], 0, 0
+        _write_at(self._file, self._written, self._buffer)
+        self._written += len(self._buffer)
+        self._buffer = bytearray()
 
     def close(self) -> None:
         """Close the file, if there is one; arrays that were mapped stay as they are."""
-        self._parts, self._bytes, self._is_closed = [], 0, True
+        self._buffer = bytearray()
         if self._file is not None:
             self._file.close()
 
@@ -309,17 +289,11 @@ class ArrayBuilder:
         Raises:
             OSError: the disk is full.
         """
-        self._require_open()
         shape = (self._length, *self._row)
         if self._file is not None:
             self._write()
             return map_file(self._file, shape, self._dtype, writable=False)
-        joined = np.concatenate([np.empty(0, np.uint8), *self._parts])
-        return joined.view(self._dtype).reshape(shape)
-
-    def _require_open(self) -> None:
-        if self._is_closed:
-            raise ValueError("array: expected a builder that is not closed")
+        return np.ndarray(shape, self._dtype, self._buffer[:])
 
     def finish(self) -> Array:
         """The array (N, *row), read-only where it is memory-mapped. Ends appending.
@@ -330,6 +304,18 @@ class ArrayBuilder:
         out = self.view()
         self.close()
         return out
+
+
+def _write_at(file: IO[bytes], at: int, content: Any) -> None:
+    """Write bytes past the buffer of a file, which could not be emptied on a full disk.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    left = memoryview(content)
+    while len(left):
+        count = os.pwrite(file.fileno(), left, at)
+        at, left = at + count, left[count:]
 
 
 class GrowingArray:
@@ -373,10 +359,7 @@ class GrowingArray:
         """
         rows = np.ascontiguousarray(rows, self.dtype).reshape(-1, *self._row)
         at = self._begin + self._length * self._row_bytes
-        left = rows.reshape(-1).view(np.uint8).data
-        while len(left):
-            count = os.pwrite(self._file.fileno(), left, at)
-            at, left = at + count, left[count:]
+        _write_at(self._file, at, rows.reshape(-1).view(np.uint8).data)
         self._length += len(rows)
 
     def truncate(self, length: int) -> None:

@@ -88,10 +88,10 @@ def _override(options: T, changes: Mapping[str, Any], where: str, prefix: str, t
             near = closest_match(name, iter_names(top), min_similarity=0.0)
             raise InputError(f"unknown option '{name}'", where=where, hint=f"nearest: '{near}'")
         current = getattr(options, key)
-        if dataclasses.is_dataclass(current) != isinstance(value, Mapping):
-            is_what = ("a value", "a section")[:: -1 if dataclasses.is_dataclass(current) else 1]
-            raise InputError(f"'{name}' is {is_what[0]}, not {is_what[1]}", where=where)
-        is_section = isinstance(value, Mapping)
+        is_section = dataclasses.is_dataclass(current)
+        if is_section != isinstance(value, Mapping):
+            what = "a section, not a value" if is_section else "a value, not a section"
+            raise InputError(f"'{name}' is {what}", where=where)
         values[key] = _override(current, value, where, f"{name}.", top) if is_section else value
     try:
         return dataclasses.replace(options, **values)  # type: ignore[type-var]
@@ -186,13 +186,13 @@ def _limits(info: FieldInfo) -> str:
     return " and ".join(f"{words[key]} {bounds[key]:.10g}" for key in words if key in bounds)
 
 
-def iter_names(options: Any, prefix: str = "") -> Iterator[str]:
+def iter_names(options: Any) -> Iterator[str]:
     """Names of all options and sections."""
-    sections = _section_names(options)
-    yield from (f"{prefix}{name}" for name in declared_fields(options) if name not in sections)
-    for name in sections:
-        yield f"{prefix}{name}"
-        yield from iter_names(getattr(options, name), f"{prefix}{name}.")
+    sections = dict[str, None]()
+    for info in iter_options(options):
+        yield info.name
+        sections[info.name.rpartition(".")[0]] = None
+    yield from filter(None, sections)
 
 
 def is_within(name: str, section: str) -> bool:

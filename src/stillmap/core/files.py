@@ -6,7 +6,6 @@ file that marks what the folder is goes first and comes last.
 """
 
 import errno
-import fcntl
 import hashlib
 import os
 import re
@@ -26,8 +25,8 @@ PREFIX = ".stillmap."  # of hidden names inside an output
 # mount points, other disks, folders that must not be changed
 _NO_RENAME = (errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES, errno.EROFS)
 _MAX_STEM = 100  # bytes of a name to which something is added
-_RANDOM = re.compile(r"[0-9a-f]{16}\.(part|old)")
-_MIN_AGE = 10.0  # s, at most, between the steps of a process that is alive
+_RANDOM = re.compile(r"[0-9a-f]{16}\.part")
+_MAX_AGE = 86_400.0  # s without a change after which work is that of a process that was killed
 _OF_DISKS = "lost+found"  # in the uppermost folder of a disk
 
 
@@ -143,22 +142,17 @@ def atomic_folder(path: Path, marker: str, overwrite: bool = False) -> Iterator[
         marker, overwrite: see `require_new`.
 
     Raises:
-        InputError: `path` is taken, or its parent cannot be written. A folder that was finished
-            but cannot take its place is kept: the message says where.
+        InputError: `path` is taken, or its parent cannot be written.
     """
     given, path = path, resolve_output(path)
     _remove_stale(path)
     require_new(given, marker, overwrite)
-    try:
+    with _naming_output(path, given):
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(path) as work, _naming_output(work, given):
             yield work
-            work.chmod(0o777 & ~_umask())
-            with _kept_on_failure(work, given):
-                require_new(given, marker, overwrite)  # it may have appeared meanwhile
-                _publish_folder(work, path, marker)
-    except OSError as error:
-        raise cannot_write(error, given) from error
+            require_new(given, marker, overwrite)  # it may have appeared meanwhile
+            _publish_folder(work, path, marker)
 
 
 @contextmanager
@@ -172,9 +166,8 @@ def temporary_folder(output: Path) -> Iterator[Path]:
     # named before it is made: an interruption right after that finds it
     work = hidden_path(output, f"{secrets.token_hex(8)}.part")
     try:
-        work.mkdir(mode=0o700)
-        with _held(work):
-            yield work
+        work.mkdir()
+        yield work
     finally:
         remove(work)
 
@@ -189,27 +182,28 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     given, path = path, resolve_output(path)
     require_new_file(given, overwrite=True)
+    _remove_stale(path)
     is_free = not path.exists()
+    work = hidden_path(path, f"{secrets.token_hex(8)}.part")
     try:
-        _remove_stale(path)
-        work = hidden_path(path, f"{secrets.token_hex(8)}.part")
-        try:
+        with _naming_output(work, given):
             os.close(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-            with _held(work), _naming_output(work, given):
-                yield work
-                if is_free and path.exists():
-                    what, hint = "has appeared meanwhile", "choose another"
-                    raise InputError(what, where=str(given), hint=hint)
-                _publish_file(work, path)
-        finally:
-            remove(work)
-    except OSError as error:
-        raise cannot_write(error, given) from error
+            yield work
+            if is_free and path.exists():
+                what, hint = "has appeared meanwhile", "choose another"
+                raise InputError(what, where=str(given), hint=hint)
+            _publish_file(work, path)
+    finally:
+        remove(work)
 
 
 @contextmanager
 def _naming_output(work: Path, output: Path) -> Iterator[None]:
-    """Errors about unfinished work name the place where it will be."""
+    """Errors of unfinished work name the place where it will be.
+
+    Raises:
+        InputError: likewise where the system refuses to write.
+    """
     try:
         yield
     except InputError as error:
@@ -217,6 +211,8 @@ def _naming_output(work: Path, output: Path) -> Iterator[None]:
             raise
         where = f"{output}{error.where.removeprefix(str(work))}"
         raise InputError(error.what, where=where, hint=error.hint) from error
+    except OSError as error:
+        raise cannot_write(error, output) from error
 
 
 def to_encodable(text: str) -> str:
@@ -229,41 +225,14 @@ def write_text(path: Path, text: str) -> None:
     path.write_bytes(to_encodable(text).encode("utf-8"))
 
 
-@contextmanager
-def _held(work: Path) -> Iterator[None]:
-    """Lock unfinished work while the block runs: `_remove_stale` leaves it alone."""
-    handle = os.open(work, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(handle)
-
-
 def _remove_stale(output: Path) -> None:
-    """Remove work of processes that were killed; what they had moved aside comes back."""
-    head, target = hidden_path(output, "").name, resolve_output(output)
+    """Remove work of processes that were killed long ago."""
+    head = hidden_path(output, "").name
     with suppress(OSError):
         for entry in workplace(output).iterdir():
             is_work = entry.name.startswith(head) and _RANDOM.fullmatch(entry.name[len(head) :])
-            if is_work and not entry.is_symlink():
-                with suppress(OSError):
-                    _remove_unless_held(entry, target)
-
-
-def _remove_unless_held(entry: Path, output: Path) -> None:
-    if time.time() - entry.lstat().st_ctime < _MIN_AGE:
-        return
-    handle = os.open(entry, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if entry.suffix == ".old" and not output.exists():
-            os.rename(entry, output)
-        else:
-            remove(entry)
-    finally:
-        os.close(handle)
+            if is_work and time.time() - entry.lstat().st_mtime > _MAX_AGE:
+                remove(entry)
 
 
 @defer_signals
@@ -348,30 +317,6 @@ def _publish_file(work: Path, path: Path) -> None:
         except BaseException:
             os.truncate(path, 0)
             raise
-
-
-@contextmanager
-def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
-    """Keep what was finished where it cannot take its place.
-
-    Raises:
-        InputError: it cannot; says where it lies.
-    """
-    try:
-        yield
-    except (OSError, InputError) as error:
-        what = (error if isinstance(error, InputError) else cannot_write(error, path)).what
-        kept, hint = work.with_name(f"{work.stem.lstrip('.')}.kept"), ""
-        with suppress(OSError):
-            os.rename(work, kept)
-            hint = f"what was made is kept in {kept}"
-        raise InputError(what, where=str(path), hint=hint) from error
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def package_version() -> str:

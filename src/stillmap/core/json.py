@@ -22,26 +22,13 @@ def read_json(path: Path, max_bytes: int, hint: str = "") -> Any:
     try:
         text = read_text(path, max_bytes)
         content = json.loads(text, parse_constant=_reject_constant)
-        if "\\u0000" in text:
-            _reject_nul(content)
+        if "\\u0000" in text:  # which no path, topic or name can hold
+            raise ValueError("a text holds NUL")
         return content
     except InputError as error:
         raise InputError(error.what, where=error.where, hint=hint) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path), hint=hint) from error
-
-
-def _reject_nul(content: Any) -> None:
-    """Refuse texts with NUL, which no path, topic or name can hold."""
-    rest = [content]
-    while rest:
-        item = rest.pop()
-        if isinstance(item, dict):
-            rest += [*item, *item.values()]
-        elif isinstance(item, list):
-            rest += item
-        elif isinstance(item, str) and "\0" in item:
-            raise ValueError("a text holds NUL")
 
 
 def _reject_constant(text: str) -> NoReturn:

@@ -66,30 +66,31 @@ class Recording(ShortRepr):
         T, M, D = self.n_scans, self.n_beams, self.dimension
         if D not in (2, 3) or self.points.shape != (M, D):
             raise ValueError(f"points: expected (M, 2) or (M, 3), got {self.points.shape}")
-        _check("stamp_ns", self.stamp_ns, (T,), np.int64)
-        _check("offset", self.offset, (T + 1,), np.int64)
-        _check("points", self.points, (M, D), np.float32)
-        _check("hit", self.hit, (M,), np.bool_)
-        _check("sensor", self.sensor, (T,), np.int32)
-        S = len(self.T_base_sensor)
-        _check("T_base_sensor", self.T_base_sensor, (S, D + 1, D + 1), np.float64)
-        for name in ("T_odom_base", "T_recorded_base"):
-            if getattr(self, name) is not None:
-                _check(name, getattr(self, name), (T, D + 1, D + 1), np.float64)
-        if self.record is not None:
-            _check("record", self.record, (T,), np.int64)
+        S, pose = len(self.T_base_sensor), (D + 1, D + 1)
+        for name, shape, dtype in (
+            ("stamp_ns", (T,), np.int64),
+            ("offset", (T + 1,), np.int64),
+            ("points", (M, D), np.float32),
+            ("hit", (M,), np.bool_),
+            ("sensor", (T,), np.int32),
+            ("T_base_sensor", (S, *pose), np.float64),
+            ("T_odom_base", (T, *pose), np.float64),
+            ("T_recorded_base", (T, *pose), np.float64),
+            ("record", (T,), np.int64),
+            ("beam_time", (M,), np.float32),
+        ):
+            array = getattr(self, name)
+            if array is not None and (array.shape != shape or array.dtype != dtype):
+                given = f"{array.shape} {array.dtype}"
+                raise ValueError(f"{name}: expected {shape} {np.dtype(dtype)}, got {given}")
         if self.beam_time is not None:
-            _check("beam_time", self.beam_time, (M,), np.float32)
             for block in arrays.iter_blocks(self.beam_time):
                 if not np.all(np.abs(self.beam_time[block]) <= MAX_BEAM_TIME):
                     raise ValueError(f"beam_time: expected up to {MAX_BEAM_TIME:g} s")
         if not are_dated(self.stamp_ns):
             raise ValueError("stamp_ns: expected times from 1824 to 2116")
-        if (
-            self.offset[0] != 0
-            or self.offset[-1] != M
-            or np.any(self.offset[1:] < self.offset[:-1])
-        ):
+        ends = (self.offset[0], self.offset[-1])
+        if ends != (0, M) or np.any(self.offset[1:] < self.offset[:-1]):
             raise ValueError(f"offset: must not decrease, from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
             raise ValueError(f"sensor: indices must lie in [0, {S})")
@@ -182,13 +183,6 @@ class Recording(ShortRepr):
     def without_odometry(self) -> Recording:
         """The recording without odometry."""
         return replace(self, T_odom_base=None)
-
-
-def _check(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: type) -> None:
-    if array.shape != shape or array.dtype != dtype:
-        raise ValueError(
-            f"{name}: expected {shape} {np.dtype(dtype)}, got {array.shape} {array.dtype}"
-        )
 
 
 def beam_stamps_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:

@@ -1,10 +1,9 @@
 """Short `repr` of dataclasses that hold arrays: shapes and types instead of numbers."""
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
-_MAX_LENGTH = 60  # characters of a value
+_MAX_LENGTH, _MAX_ITEMS = 60, 4  # characters of a value, items that are shown
 
 
 class ShortRepr:
@@ -30,13 +29,9 @@ class ShortRepr:
 def _describe(value: Any) -> str:
     """A value in a few characters."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-    if shape is not None and dtype is not None:
-        return repr(value.item()) if shape == () else f"<{dtype} {tuple(shape)}>"
-    if isinstance(value, ShortRepr) or dataclasses.is_dataclass(value):
-        return f"{type(value).__name__}(...)"
-    if isinstance(value, Mapping | list | set | frozenset) or (
-        isinstance(value, tuple) and len(value) > 4
-    ):
-        return f"<{type(value).__name__} of {len(value)}>" if len(value) else repr(value)
-    text = repr(value)
+    if shape and dtype is not None:
+        return f"<{dtype} {tuple(shape)}>"
+    if isinstance(value, list | dict | tuple | set | frozenset) and len(value) > _MAX_ITEMS:
+        return f"<{type(value).__name__} of {len(value)}>"
+    text = repr(value.item() if shape == () else value)
     return text if len(text) <= _MAX_LENGTH else f"<{type(value).__name__}>"

@@ -4,7 +4,7 @@ A robot that drives a kilometre sees a strip, but the box around it is most of a
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -127,14 +127,14 @@ class TiledArray(NDArrayOperatorsMixin):
                 self.release()
             self._add(i, j)[row[some] - i * TILE, column[some] - j * TILE] = values[some]
 
-    def map_tiles(
-        self, function: Callable[[NDArray[Any]], NDArray[Any]], dtype: DTypeLike
-    ) -> "TiledArray":
-        """Apply an element-wise function; the fill value becomes what it makes of it."""
-        fill = function(np.full((1, 1), self.fill, self.dtype))[0, 0]
+    def astype(self, dtype: DTypeLike, copy: bool = False) -> "TiledArray":  # noqa: ARG002
+        """The array with elements of a type, itself where they have it."""
+        if self.dtype == dtype:
+            return self
+        fill = np.asarray(self.fill, self.dtype).astype(dtype).item()
         out = TiledArray(self.shape, dtype, fill, self._scratch)
         for (rows, columns), tile in self.tiles():
-            out.set_tile(rows.start // TILE, columns.start // TILE, function(tile))
+            out.set_tile(rows.start // TILE, columns.start // TILE, tile.astype(dtype))
         return out
 
     def release(self) -> None:
@@ -187,14 +187,6 @@ def compact(layer: TiledArray) -> Any:
     return layer
 
 
-def as_type(layer: Layer, dtype: DTypeLike) -> Layer:
-    """The layer with elements of a type, itself where they have it."""
-    if isinstance(layer, TiledArray):
-        same = layer.dtype == dtype
-        return layer if same else layer.map_tiles(lambda part: part.astype(dtype), dtype)
-    return np.asarray(layer, dtype)
-
-
 def tiles_of(layer: Layer) -> Iterator[tuple[Block, NDArray[Any]]]:
     """The parts of a layer that may differ from its fill value, and where they lie."""
     if isinstance(layer, TiledArray):
@@ -225,12 +217,8 @@ def cut(layer: Layer, block: Block, scratch: Path | None) -> Any:
     out = TiledArray(shape, layer.dtype, layer.fill, scratch)
     for i, j in tile_numbers(np.empty(shape, np.bool_)):
         r, c = out._block(i, j)
-        part = layer.crop(
-            (
-                slice(rows.start + r.start, rows.start + r.stop),
-                slice(columns.start + c.start, columns.start + c.stop),
-            )
-        )
+        r = slice(rows.start + r.start, rows.start + r.stop)
+        part = layer.crop((r, slice(columns.start + c.start, columns.start + c.stop)))
         if not np.array_equal(part, np.full_like(part, layer.fill), equal_nan=True):
             out.set_tile(i, j, part)
     return compact(out)

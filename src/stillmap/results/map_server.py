@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
 from stillmap.core.grid_map import GridMap
-from stillmap.core.tiles import Layer, TiledArray, as_type, compact, rows_of
+from stillmap.core.tiles import Layer, TiledArray, compact, rows_of
 from stillmap.em import Coverage, OccupancyMap
 from stillmap.io.images import write_png
 from stillmap.mapping import Change
@@ -149,16 +149,16 @@ def write_map_npz(
     given: `looks`, `clear_looks`, `thin` (H, W).
     """
     arrays: dict[str, Layer] = {
-        "p_occupied": as_type(occupancy.p_occupied, np.float32),
-        "alpha": as_type(occupancy.alpha, np.float32),
-        "beta": as_type(occupancy.beta, np.float32),
+        "p_occupied": occupancy.p_occupied.astype(np.float32, copy=False),
+        "alpha": occupancy.alpha.astype(np.float32, copy=False),
+        "beta": occupancy.beta.astype(np.float32, copy=False),
         "changed": changed_cells(occupancy, changes),
     }
     if evidence is not None:
         arrays |= {
-            "looks": as_type(evidence.observations, np.uint16),
-            "clear_looks": as_type(evidence.unobstructed, np.uint16),
-            "thin": as_type(evidence.thinly_observed, np.bool_),
+            "looks": evidence.observations.astype(np.uint16, copy=False),
+            "clear_looks": evidence.unobstructed.astype(np.uint16, copy=False),
+            "thin": evidence.thinly_observed.astype(np.bool_, copy=False),
         }
     arrays |= {
         "origin": np.asarray(occupancy.origin, np.float64),
