@@ -2,21 +2,20 @@
 
 import hashlib
 import logging
-import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError, cannot_write, import_extra
 from stillmap.core.files import atomic_file, package_version, resolve_output, to_encodable
 from stillmap.core.input_files import hold_lock
 from stillmap.core.json import to_json
-from stillmap.fleet.inputs import Source, find_sources
-from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
+from stillmap.core.profiling import Show
+from stillmap.fleet.inputs import Entry, Source, find_sources
 from stillmap.fleet.locations import absolute, explain, is_folder_name, is_local, open_location
-from stillmap.fleet.tasks import STAGING, Task, read_made, run_task
+from stillmap.fleet.tasks import PLACES, RESULTS, STAGING, Outcome, Task, read_made, run_task
 from stillmap.results.report import template
 
 LIST, PAGE = "fleet.json", "fleet.html"
@@ -24,6 +23,98 @@ _LOCK = ".lock"
 # Ctrl-C at a terminal reaches all processes: the client alone ends its workers
 _PRELOAD = ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]
 _TIMEOUT = 15  # s for the scheduler to answer
+
+
+_FACTS = ("scans", "beams", "duration_s", "bytes")  # in `fleet.json`
+
+
+class Request(NamedTuple):
+    """The job of a fleet.
+
+    Attributes:
+        entries: recordings, folders and patterns of them, with their places.
+        output: folder or URL of the fleet.
+        command: runs a command line of stillmap on a worker; a function of a module.
+        map_flags, merge_flags: flags of `map` and `merge`.
+        jobs: local processes at once.
+        scheduler: address of a Dask scheduler; empty: local processes.
+        fail: takes a line about a recording or a place that failed.
+        progress: takes what is done, and how many of how many have ended.
+    """
+
+    entries: Sequence[Entry]
+    output: str
+    command: Callable[[list[str]], None]
+    fail: Callable[[str], None]
+    progress: Show
+    map_flags: tuple[str, ...] = ()
+    merge_flags: tuple[str, ...] = ()
+    jobs: int = 1
+    scheduler: str = ""
+
+
+class Job(NamedTuple):
+    """A recording, and how mapping it ended."""
+
+    source: Source
+    outcome: Outcome
+
+
+class Place(NamedTuple):
+    """A place, its recordings, and how merging their results ended; None: too few to merge."""
+
+    name: str
+    jobs: list[Job]
+    outcome: Outcome | None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether its result is there."""
+        return self.outcome is not None and self.outcome.is_done
+
+    @property
+    def why(self) -> str:
+        """Why there is no result."""
+        if self.outcome is not None:
+            return self.outcome.why
+        n = sum(job.outcome.is_done for job in self.jobs)
+        return f"merging takes two maps, this place has {n or 'none'}"
+
+
+class Fleet(NamedTuple):
+    """Result of a fleet."""
+
+    jobs: list[Job]
+    places: list[Place]
+
+    @property
+    def failed(self) -> int:
+        """How many recordings and places failed."""
+        merged = [place.outcome for place in self.places if place.outcome is not None]
+        return sum(not one.is_done for one in [*(job.outcome for job in self.jobs), *merged])
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """The content of `fleet.json`: an entry for each recording."""
+        places = {place.name: place for place in self.places}
+        return [_describe(job, places.get(job.source.place or "")) for job in self.jobs]
+
+
+def _describe(job: Job, place: Place | None) -> dict[str, Any]:
+    source, outcome = job.source, job.outcome
+    merged = place is not None and place.is_done
+    return {
+        "input": source.input,
+        "name": source.name,
+        "place": source.place,
+        "status": outcome.status,
+        "why": outcome.why,
+        "result": f"{RESULTS}/{source.name}" if outcome.is_done else None,
+        "cpu_seconds": round(outcome.cpu_seconds, 3),
+        "peak_memory_bytes": outcome.peak_memory_bytes,
+        **{name: outcome.summary.get(name) for name in _FACTS},
+        "place_result": f"{PLACES}/{source.place}" if merged else None,
+        "place_why": "" if place is None or merged else place.why,
+    }
 
 
 def run_fleet(request: Request) -> Fleet:
@@ -39,8 +130,8 @@ def run_fleet(request: Request) -> Fleet:
     if is_local(request.output):
         root = str(resolve_output(Path(root)))
     _require_fleet(root)
+    sources = find_sources(request.entries, _known_names(root))
     with _hold_output(root):
-        sources = find_sources(request.entries, _known_names(root))
         with _remove_unfinished(root, request), _open_client(request) as client:
             tasks = [
                 Task("map", source.name, (source.input,), root, request.map_flags)
@@ -83,20 +174,16 @@ def _hold_output(root: str) -> Iterator[None]:
             fs.rm_file(f"{path}/{_LOCK}")
         yield
         return
-    folder = Path(path)
-    made = [part for part in (folder, *folder.parents) if not os.path.lexists(part)]
+    lock = Path(path, _LOCK)
     try:
-        file = hold_lock(folder / _LOCK, "another fleet is writing there", root)
+        file = hold_lock(lock, "another fleet is writing there", root)
     except OSError as error:
         raise cannot_write(error, root) from error
-    try:
-        yield
-    finally:
-        (folder / _LOCK).unlink(missing_ok=True)
-        with suppress(OSError):  # it holds something
-            for empty in made:
-                empty.rmdir()
-        file.close()
+    with file:
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def _known_names(root: str) -> dict[str, str]:

@@ -14,7 +14,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -27,17 +27,44 @@ from stillmap.core.files import package_version, write_text
 from stillmap.core.input_files import read_text
 from stillmap.core.json import to_json
 from stillmap.core.profiling import peak_memory_bytes, reset_peak_memory
-from stillmap.fleet.jobs import PLACES, RESULTS, Outcome
 from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location
 from stillmap.results.reader import read_grid, read_run
 from stillmap.results.report.figures import data_uri, draw_map, map_window
 
+RESULTS, PLACES = "results", "places"  # folders of the fleet
 MADE = "made.json"  # of each result of a fleet
 STAGING = ".part-"  # begins the names of unfinished results
 _MAX_BYTES = 1 << 30  # of a record or report
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_outcome = TypeAdapter(Outcome)
 _PIXELS, _GREYS = 90_000, 16  # of the small map of the page, at most
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a task.
+
+    Attributes:
+        status: `done`, `failed`, or `full`: a disk is, and no task can go on.
+        why: one line; empty where it is done.
+        key: of what the result was made from.
+        input: its recording, or the first of them.
+        cpu_seconds: of its worker meanwhile.
+        peak_memory_bytes: of its worker.
+        summary: of the result, JSON-able.
+    """
+
+    status: Literal["done", "failed", "full"]
+    why: str = ""
+    key: str = ""
+    input: str = ""
+    cpu_seconds: float = 0.0
+    peak_memory_bytes: int = 0
+    summary: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the result is there."""
+        return self.status == "done"
 
 
 @dataclass(frozen=True)
@@ -134,7 +161,7 @@ def read_made(root: str, folder: str) -> Outcome | None:
     fs, path = open_location(root)
     with explain(f"{root}/{folder}", "read"):
         try:
-            return _outcome.validate_json(fs.cat_file(f"{path}/{folder}/{MADE}"))
+            return TypeAdapter(Outcome).validate_json(fs.cat_file(f"{path}/{folder}/{MADE}"))
         except (FileNotFoundError, NotADirectoryError, ValidationError):
             return None
 
