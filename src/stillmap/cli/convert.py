@@ -5,13 +5,6 @@ from pathlib import Path
 
 from stillmap.cli.arguments import OVERWRITE, READ, make_parents, read_options, require_apart
 from stillmap.cli.console import say, show_share
-from stillmap.cli.convert_result import (
-    CLOUDS,
-    NAV2,
-    ZONE_FLAGS,
-    convert_result,
-    given_zone_flags,
-)
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 
@@ -20,13 +13,14 @@ ENDINGS = (
     *(".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
     *(".bag", ".db3", ".mcap", ".ply", ".las", ".laz"),
 )
+CLOUDS = ".las, .laz, .e57, .pcd, .ply, .xyz"
 NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "ply", "las")
 
 DESCRIPTION = (
     "Write a recording in another format, by the ending of FILE: "
     f"{', '.join(ENDINGS)}; else a folder. A result of `stillmap map` becomes a bag (.mcap for "
     "Foxglove), in 2D a table of its beams (.parquet), in 3D a point "
-    f"cloud with p_static and colours ({', '.join(CLOUDS)}), "
+    f"cloud with p_static and colours ({CLOUDS}), "
     "or maps and masks for nav2. A place becomes maps and masks, in 3D also a "
     "cloud; its sessions, PLACE/sessions/NAME, all of this."
 )
@@ -42,12 +36,19 @@ EPILOG = """examples:
 
 
 FLAGS = f"""
-input INPUT  a recording, or a folder that `stillmap map` or `merge` wrote
+source INPUT  a recording, or a folder that `stillmap map` or `merge` wrote
 -o --output FILE!  converted file or folder
---to {{{",".join((*NAMES, NAV2))}}}  the format
---input FILE -> recording  a result's recording, if it was moved
+--to {{{",".join(NAMES)},nav2}}  the format
+--input FILE  a result's recording, if it was moved
 --only {{static,dynamic}}  these points of a cloud (default: all)
-{OVERWRITE}{ZONE_FLAGS}{READ.replace("--to ", "")}"""
+{OVERWRITE}
+maps and masks of a result for nav2, in a folder (docs/tutorials/2d-bag-to-nav2.md):
+--mask FILE.geojson  polygons in metres in the map frame, each with an action: erase, block,
+  keepout, or speed
+--keepout-crossings N  keep out of the squares of the floor that were crossed N times or more
+--slow-crossings N  limit the speed in the squares that were crossed N times or more
+--slow-to LIMIT  to LIMIT in m/s, or in per cent of the robot's maximum (default: 50%%)
+{READ.replace("--to ", "")}"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,8 +60,10 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.io.registry import detect_format
     from stillmap.results.reader import is_result
 
-    source = Path(args.input)
+    source = Path(args.source)
     if is_result(source):
+        from stillmap.cli.convert_result import convert_result  # takes long to load
+
         convert = convert_result
     else:
         detect_format(source)  # a missing input is reported before a bad output
@@ -80,13 +83,10 @@ def _convert_recording(
     """Convert a recording; return what was lost, and what was written."""
     from stillmap.io import read, writers
 
-    for flag, is_given in (
-        ("--input", args.recording),
-        ("--only", args.only),
-        (f"--to {NAV2}", args.to == NAV2),
-        *given_zone_flags(args).items(),
-    ):
-        if is_given:
+    names = "input", "only", "mask", "keepout_crossings", "slow_crossings", "slow_to"
+    given = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
+    for flag, value in {**given, "--to nav2": True if args.to == "nav2" else None}.items():
+        if value is not None:
             raise InputError(f"{flag} is for results", where=str(source))
     options = read_options(args)
     require_apart(output, source)
