@@ -24,8 +24,7 @@ from stillmap.cli.console import print_json, say, show_progress, show_share
 from stillmap.core.errors import InputError, import_extra
 
 if TYPE_CHECKING:
-    from stillmap.core.recording import Recording
-    from stillmap.live.replay import Latency, Show
+    from stillmap.live.replay import Show
     from stillmap.pipeline.options import Options
 
 DESCRIPTION = (
@@ -114,8 +113,14 @@ def _replay(
 ) -> int:
     from stillmap.live.mapper import LiveMapper
     from stillmap.live.replay import replay, signal_flag
+    from stillmap.pipeline import inputs
 
-    recording = _read(args, options, Path(settings["scratch"]))
+    scratch = Path(settings["scratch"])
+    with show_share(args.quiet, "reading") as share:
+        recording = inputs.read(args.replay, options.read, progress=share, scratch=scratch)
+    inputs.require_mappable(recording, options, None)
+    if args.no_odometry:
+        recording = recording.without_odometry()
     # Ctrl-C ends the drive then, not the command
     stops = args.foxglove or args.rate is not None
     with (
@@ -128,7 +133,9 @@ def _replay(
         if has_scans:
             mapper.save(args.output, overwrite=args.overwrite, progress=progress)
     if not args.quiet:
-        say(describe(latency))
+        median, p99, most = latency.to_dict()["latency_ms"].values()
+        timing = f"{median:.1f} ms each (99 %: {p99:.1f} ms, at most {most:.1f} ms)"
+        say(f"{len(latency.seconds)} scans, {timing}")
         say(f"wrote {args.output}" if has_scans else "no scan was mapped: nothing was written")
     if args.json:
         print_json({"output": args.output if has_scans else None, **latency.to_dict()})
@@ -170,21 +177,3 @@ def _serve(args: argparse.Namespace) -> "Iterator[Show | None]":
     with FoxgloveServer(args.host or HOST, PORT if args.port is None else args.port) as server:
         say(f"seen live at {server.url}, in Foxglove or Lichtblick")
         yield server.show
-
-
-def _read(args: argparse.Namespace, options: "Options", scratch: Path) -> "Recording":
-    from stillmap.pipeline import inputs
-
-    with show_share(args.quiet, "reading") as progress:
-        recording = inputs.read(args.replay, options.read, progress=progress, scratch=scratch)
-    inputs.require_mappable(recording, options, None)
-    return recording.without_odometry() if args.no_odometry else recording
-
-
-def describe(latency: "Latency") -> str:
-    """One line about the latencies of a replay."""
-    numbers = latency.to_dict()["latency_ms"]
-    assert isinstance(numbers, dict)
-    median, p99, most = (numbers[name] for name in ("median", "p99", "max"))
-    count = len(latency.seconds)
-    return f"{count} scans, {median:.1f} ms each (99 %: {p99:.1f} ms, at most {most:.1f} ms)"

@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -81,18 +81,22 @@ def _read_tilting_laser(
         raise InputError(what, where=args.input[0])
     from stillmap.pipeline.tilting import check_rig  # only a rig needs it
 
-    paths = [part.path or "" for part in planar.source.parts] or args.input
-
+    paths = [Path(path)] if path else [Path(part.path or "") for part in planar.source.parts]
+    paths = paths or [Path(word) for word in args.input]
     # the part to be mapped counts from the start of the planar recording, which has the topics
-    read_as = dataclasses.replace(options, start=None, end=None, topic=None, tilting_topic=None)
+    read_as = dataclasses.replace(
+        options,
+        start=None,
+        end=None,
+        tilting_topic=None,
+        topic=topic,
+        base_frame=options.base_frame if path else planar.source.base_frame or None,
+    )
     with show_share(args.quiet, "reading") as progress:
-        if topic is None:
-            tilting = read(Path(path), read_as, progress=progress, scratch=scratch)
-        else:
-            base_frame = planar.source.base_frame or None
-            read_as = dataclasses.replace(read_as, topic=topic, base_frame=base_frame)
-            tilting = _read_topic(paths, ReadContext(read_as, progress, scratch))
-    where = path or paths[0]
+        context = ReadContext(read_as, progress, scratch)
+        tilting = read(paths[0], read_as, progress=progress, scratch=scratch) if path else None
+        tilting = tilting or _read_topic(paths, context)
+    where = str(paths[0])
     if planar.source.part is not None:
         origin_ns = planar.source.part.first_stamp_ns
         tilting = select_time(tilting, TimeWindow(options, origin_ns), where)
@@ -101,14 +105,14 @@ def _read_tilting_laser(
     return dataclasses.replace(tilting, source=source)
 
 
-def _read_topic(paths: Sequence[str], context: ReadContext) -> Recording:
+def _read_topic(paths: Sequence[Path], context: ReadContext) -> Recording:
     from stillmap.io.ros.reader import read_parts  # message types take long to load
 
     for path in paths:
-        if detect_format(Path(path)).name != "ROS bag":
-            raise InputError("--tilting-topic is for bags", where=path)
+        if detect_format(path).name != "ROS bag":
+            raise InputError("--tilting-topic is for bags", where=str(path))
     with np.errstate(over="ignore", invalid="ignore"):
-        raw = read_parts([Path(path) for path in paths], context, tilting=True)
+        raw = read_parts(paths, context, tilting=True)
         return interpret(raw, context.options, context.scratch)
 
 
@@ -149,8 +153,15 @@ def _build_models(
     result: MappingResult, tilting: "TiltingResult | None", progress: Progress, stages: StageTimer
 ) -> "tuple[Models | None, list[str]]":
     """Build the meshes of a 3D recording where they are wanted; return them and warnings."""
-    if not _wants_models(result, tilting):
+    enabled = result.options.mesh.enabled
+    recording = result.recording if tilting is None else tilting.recording
+    if recording.dimension == 2 or enabled is False:
         return None, []
+    if enabled is None:
+        from stillmap.mesh.views import usable_images  # takes long to load
+
+        if recording.images is None or not usable_images(recording)[0].any():
+            return None, []
     from stillmap.results.models import build_models  # meshes take long to load
 
     try:
@@ -160,23 +171,9 @@ def _build_models(
     warnings = []
     if not len(models.assignment.mesh):
         warnings.append("no mesh of the place: hardly any beams are neighbours on a surface")
-    if count := len(models.unread):
-        what = "an image is not used" if count == 1 else f"{count} images are not used, the first"
-        warnings.append(f"{what}: {models.unread[0]}")
+    if models.unread:
+        warnings.append(f"images that are not used: {len(models.unread)}, {models.unread[0]}")
     return models, warnings
-
-
-def _wants_models(result: MappingResult, tilting: "TiltingResult | None") -> bool:
-    """True if models are enabled, or could be textured where nothing is said about them."""
-    enabled = result.options.mesh.enabled
-    recording = result.recording if tilting is None else tilting.recording
-    if recording.dimension == 2 or enabled is False:
-        return False
-    if enabled or recording.images is None:
-        return bool(enabled)
-    from stillmap.mesh.views import usable_images  # takes long to load
-
-    return bool(usable_images(recording)[0].any())
 
 
 def _load_checkpoint(
@@ -232,9 +229,17 @@ def print_summary(
     result: MappingResult, tilting: "TiltingResult | None", models: "Models | None", output: Path
 ) -> None:
     """Print what was found, what is to be known about it, and where it lies."""
+    n, quality = len(result.iterations), result.quality
     say(f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}")
-    for line in _describe_result(result):
-        say(line)
+    ending = "" if result.converged else ", which had not converged"
+    say(f"kept iteration {result.best_iteration} of {n}{ending}")
+    if quality.overall is not None:
+        parts = {"labels": quality.labels, "geometry": quality.geometry}
+        known = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
+        say(f"quality {quality.overall:.0f} of 100: {', '.join(known)}")
+    if result.changes:
+        state = result.options.output.map_state
+        say(f"{len(result.changes)} places changed; the map shows their state: {state}")
     if tilting is not None:
         left_out = f"; {tilting.unposed_beams} left out: the robot's pose is not known there"
         hits = _describe_hits(tilting.deskewed, tilting.p_static)
@@ -247,25 +252,6 @@ def print_summary(
         say("no surface model: the recording has no pictures, --mesh makes a grey one")
     say(f"wrote {output}: open {output / 'report.html'}")
     say(f"see it over time: stillmap view {shlex.quote(str(output))}")
-
-
-def _describe_result(result: MappingResult) -> Iterator[str]:
-    """Iterations, quality and changes."""
-    n, quality, changed = len(result.iterations), result.quality, len(result.changes)
-    if n == 1 and result.converged:
-        yield "converged after one iteration"
-    else:
-        ending = "" if result.converged else ", which had not converged"
-        yield f"kept iteration {result.best_iteration} of {n}{ending}"
-    if quality.overall is not None:
-        parts = {"labels": quality.labels, "geometry": quality.geometry}
-        known = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
-        yield f"quality {quality.overall:.0f} of 100: {', '.join(known)}"
-    if changed:
-        last = result.options.output.map_state == "last"
-        state = "its last state" if last else "the state that it was in for longest"
-        each = "it" if changed == 1 else "each"
-        yield f"{changed} place{'s' * (changed > 1)} changed, the map shows {each} in {state}"
 
 
 def _describe_hits(recording: Recording, p_static: NDArray[np.float32]) -> str:

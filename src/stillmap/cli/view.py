@@ -13,14 +13,11 @@ from stillmap.core.errors import InputError, MissingExtra, import_extra, printab
 from stillmap.core.profiling import is_terminal
 
 if TYPE_CHECKING:
-    from stillmap.results.folder import ResultFolder
     from stillmap.results.viewer.beams import Beams
     from stillmap.results.viewer.scene import Scene
 
 
-_REPORT = "report.html"
-
-_LAST_PORT = 65_535
+_REPORT, _LAST_PORT = "report.html", 65_535
 
 DESCRIPTION = (
     "Show a result in the browser, scan by scan: map, beams, points, surface, "
@@ -62,15 +59,15 @@ def run(args: argparse.Namespace) -> int:
         # a script gets the name itself
         print(printable(str(report)) if is_terminal(sys.stdout) else report)
     elif args.report:
-        _show_report(report)
+        _open_report(report)
     else:
         try:
             import_extra("viser", args.result, "shown over time", group="viewer")
         except MissingExtra as error:
             say(f"{error}; the report is shown")
-            _show_report(report)
-        else:
-            _serve(args, folder)
+            _open_report(report)
+            return 0
+        _serve(args, folder)
     return 0
 
 
@@ -95,11 +92,6 @@ def _find_report(folder: Path) -> Path:
     return report
 
 
-def _show_report(report: Path) -> None:
-    if not _open_browser(report.as_uri()):
-        say(f"no browser found; the report is {report}")
-
-
 def _has_screen() -> bool:
     """True if a graphical browser can open; without a screen it would be a text browser."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
@@ -113,6 +105,11 @@ def _open_browser(address: str) -> bool:
     import webbrowser
 
     return webbrowser.open(address)
+
+
+def _open_report(report: Path) -> None:
+    if not _open_browser(report.as_uri()):
+        say(f"no browser found; the report is {report}")
 
 
 def _serve(args: argparse.Namespace, folder: Path) -> None:
@@ -149,6 +146,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
 def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beams | None"]:
     """The result of one recording; without beams where that cannot be read and is not named."""
     from stillmap.results.folder import open_result
+    from stillmap.results.viewer.beams import Beams
     from stillmap.results.viewer.scene import read_scene
 
     result = open_result(folder, args.input)
@@ -156,20 +154,14 @@ def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beam
     if args.no_beams:
         return scene, None
     try:
-        return scene, _read_beams(result, args.quiet)
+        with show_share(args.quiet, "reading") as progress:
+            recording, labels = result.read(progress)
+        recording = result.calibrate(recording)
+        poses = result.read_poses(recording)
+        return scene, Beams(recording, labels.p_static, poses, result.slam_options)
     except InputError as error:
         if args.input:
             raise
-        error = in_flags(error)
-        say(f"without beams: {error}")
-        return replace(scene, notes=[f"Without beams: {error}", *scene.notes]), None
-
-
-def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
-    from stillmap.results.viewer.beams import Beams
-
-    with show_share(quiet, "reading") as progress:
-        recording, labels = result.read(progress)
-    recording = result.calibrate(recording)
-    poses = result.read_poses(recording)
-    return Beams(recording, labels.p_static, poses, result.slam_options)
+        note = f"without beams: {in_flags(error)}"
+        say(note)
+        return replace(scene, notes=[f"W{note[1:]}", *scene.notes]), None

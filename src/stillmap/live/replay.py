@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class Latency:
     dropped: int
     peak_memory_bytes: int
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, Any]:
         """As `stillmap live --json` prints it."""
         ms = 1e3 * self.seconds if len(self.seconds) else np.zeros(1)
         return {
