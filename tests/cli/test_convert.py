@@ -49,14 +49,6 @@ def test_to_a_recording_folder(call, room, tmp_path):
     assert after.source == before.source
 
 
-def test_losses_are_reported(call, tmp_path, nothing_left):
-    call("simulate", "hall", "-o", tmp_path / "s", "--scans", 3, "--sweep-time", 0.1, "--quiet")
-    done = call("convert", tmp_path / "s", "-o", tmp_path / "a.log")
-    assert "warning: beam times are left out" in done.stderr
-    assert call("convert", tmp_path / "s", "-o", tmp_path / "b.log", "--quiet").stderr == ""
-    nothing_left("s", "a.log", "b.log")
-
-
 def test_refusals(call, room, tmp_path, nothing_left):
     precious = tmp_path / "precious"
     precious.mkdir()
@@ -154,15 +146,6 @@ def test_formats_that_results_do_not_have(call, room, mapped, tmp_path, nothing_
     for output in (mapped, mapped.parent, room):
         done = call("convert", mapped, "-o", output, "--overwrite", "--to", "ros2")
         refused(done, "recording")
-    nothing_left()
-
-
-def test_only_is_for_clouds(call, room, mapped, tmp_path, nothing_left):
-    refused(
-        call("convert", mapped, "-o", tmp_path / "a.mcap", "--only", "static"), "--only", ".las"
-    )
-    done = call("convert", room, "-o", tmp_path / "a.log", "--only", "static")
-    refused(done, "--only is for results")
     nothing_left()
 
 

@@ -1,17 +1,11 @@
 """`stillmap convert RESULT --mask`: files of zones that are at fault, and calls that are."""
 
 import json
-import os
 import shutil
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 from refusals import refused
-
-from stillmap.core.errors import InputError
-from stillmap.results.export.zones import read_zones
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]
 
@@ -80,41 +74,6 @@ def test_faulty_zones(call, mapped, tmp_path, nothing_left, content, words):
     nothing_left("zones.geojson")
 
 
-def test_files_that_cannot_be_read(call, mapped, tmp_path, nothing_left):
-    for name, words in (("none", "No such file"), (".", "it is a folder")):
-        refused(call("convert", mapped, "-o", tmp_path / "m", "--mask", tmp_path / name), words)
-    os.mkfifo(tmp_path / "pipe")
-    refused(call("convert", mapped, "-o", tmp_path / "m", "--mask", tmp_path / "pipe"), "regular")
-    (tmp_path / "large").write_bytes(b" " * ((16 << 20) + 1))
-    refused(
-        call("convert", mapped, "-o", tmp_path / "m", "--mask", tmp_path / "large"), "too large"
-    )
-    nothing_left("pipe", "large")
-
-
-_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner),
-    max_leaves=8,
-)
-
-
-@given(coordinates=_JSON, action=st.sampled_from(["erase", "speed"]) | _JSON, speed=_JSON)
-@example(coordinates=[SQUARE], action="erase", speed=None)
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_json_is_read_or_refused(tmp_path, coordinates, action, speed):
-    path = tmp_path / "zones.geojson"
-    one = feature(polygon(*[coordinates]), action=action, speed=speed)
-    one["geometry"]["coordinates"] = coordinates
-    path.write_text(collection(one))
-    try:
-        zones = read_zones(path)
-    except InputError as error:
-        assert "\n" not in str(error)  # noqa: PT017
-    else:
-        assert zones[0].polygons
-
-
 def test_calls_at_fault(call, room, mapped, tmp_path, nothing_left):
     zones = tmp_path / "zones.geojson"
     zones.write_text(collection(BLOCK))
@@ -142,15 +101,6 @@ def test_only_folders_of_its_kind_are_replaced(call, mapped, tmp_path):
     refused(done, "only a folder with nav2_params.yaml is replaced")
     for flags, status in (((), 0), ((), 2), (("--overwrite",), 0)):
         assert call("convert", mapped, "-o", out, "--to", "nav2", *flags).returncode == status
-
-
-def test_the_recording_is_not_needed(call, mapped, tmp_path):
-    result = tmp_path / "result"
-    shutil.copytree(mapped, result)
-    record = json.loads((result / "run.json").read_text())
-    record["input"]["path"] = str(tmp_path / "gone")
-    (result / "run.json").write_text(json.dumps(record))
-    assert call("convert", result, "-o", tmp_path / "a", "--to", "nav2").returncode == 0
 
 
 def test_results_of_other_versions(call, mapped, tmp_path):

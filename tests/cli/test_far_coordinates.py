@@ -96,19 +96,6 @@ def test_static_points_of_a_bag_are_near(call, mapped, tmp_path, states_origin):
     assert np.abs(np.array([at.x, at.y, at.z]) - UTM).max() < 50.0
 
 
-def test_a_pose_that_cannot_be(call, lidar, tmp_path):
-    lines = (lidar / "poses.tum").read_text().splitlines()
-    words = lines[2].split()
-    lines[2] = " ".join([words[0], "1e10", *words[2:]])
-    path = tmp_path / "poses.tum"
-    path.write_text("\n".join(lines))
-    done = call("map", lidar / "sim", "-o", tmp_path / "out", "--poses", path, "--quiet")
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"stillmap: {path}:3: is no pose")
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("command", ["map", "live --replay", "convert"])
 @pytest.mark.parametrize("lidar_settings", [None, {"channels": 8, "columns": 60, "sweep": False}])
 def test_a_sensor_that_is_not_on_the_robot(call, tmp_path, command, lidar_settings):

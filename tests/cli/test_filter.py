@@ -1,6 +1,5 @@
 """`stillmap filter`: recordings without dynamic beams."""
 
-import json
 import shutil
 
 import numpy as np
@@ -25,14 +24,6 @@ def test_dynamic_beams_become_misses(call, room, mapped, tmp_path, below):
     np.testing.assert_array_equal(after.stamp_ns, before.stamp_ns)
     assert blank.any() == (below != 0.0)
     assert f"{np.count_nonzero(blank)} beams blanked" in done.stderr
-
-
-def test_a_recording_named_by_its_header(call, room, tmp_path):
-    done = call("map", room / "recording.json", "-o", tmp_path / "out", *QUICK)
-    assert done.returncode == 0, done.stderr
-    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean")
-    assert done.returncode == 0, done.stderr
-    assert stillmap_folder.read(tmp_path / "clean").n_beams == stillmap_folder.read(room).n_beams
 
 
 def test_filtered_log(call, tmp_path):
@@ -109,25 +100,6 @@ def test_other_formats_of_points(call, room, mapped, tmp_path, form):
     assert f"warning: {misses} beams without a return are left out" in done.stderr
 
 
-def test_formats_that_are_not_written(call, mapped, tmp_path):
-    for name in ("clean.pcd", "clean.e57", "clean.3d"):
-        refused(call("filter", mapped, "-o", tmp_path / name), name, "other formats", "--to")
-    assert not list(tmp_path.iterdir())
-
-
-def test_moved_recording(call, room, mapped, tmp_path):
-    elsewhere = tmp_path / "moved"
-    shutil.copytree(room, elsewhere)
-    result = tmp_path / "result"
-    shutil.copytree(mapped, result)
-    record = json.loads((result / "run.json").read_text())
-    record["input"]["path"] = str(tmp_path / "gone")
-    (result / "run.json").write_text(json.dumps(record))
-    refused(call("filter", result, "-o", tmp_path / "clean"), tmp_path / "gone", "does not exist")
-    done = call("filter", result, "-o", tmp_path / "clean", "--input", elsewhere)
-    assert done.returncode == 0, done.stderr
-
-
 def test_refusals(call, room, mapped, tmp_path):
     refused(call("filter", tmp_path / "nothing", "-o", tmp_path / "c"), "nothing/run.json")
     refused(call("filter", mapped, "-o", room, "--overwrite"), "the recording itself")
@@ -172,23 +144,3 @@ def test_damaged_run_json(call, mapped, tmp_path, content, words):
     shutil.copytree(mapped, result)
     (result / "run.json").write_text(content)
     refused(call("filter", result, "-o", tmp_path / "c"), words)
-
-
-def test_other_recording_is_refused(call, room, mapped, tmp_path):
-    shorter = stillmap_folder.read(room)
-    path = tmp_path / "shorter"
-    n = int(shorter.offset[10])
-    stillmap_folder.write(
-        type(shorter)(
-            stamp_ns=shorter.stamp_ns[:10],
-            offset=shorter.offset[:11],
-            points=np.array(shorter.points[:n]),
-            hit=np.array(shorter.hit[:n]),
-            T_base_sensor=shorter.T_base_sensor,
-            sensor=shorter.sensor[:10],
-            T_odom_base=None,
-        ),
-        path,
-    )
-    done = call("filter", mapped, "-o", tmp_path / "c", "--input", path)
-    refused(done, "is not the recording that was mapped", "--input")

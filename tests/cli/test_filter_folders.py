@@ -1,8 +1,5 @@
 """`stillmap filter` of folders, into other formats, and what is refused."""
 
-import signal
-import time
-
 import numpy as np
 import pytest
 from labelled import N, check_same_but, files, kitti, label, run
@@ -99,15 +96,6 @@ def test_refusals_come_before_anything_is_read(call, tmp_path):
     assert sorted(one.name for one in tmp_path.iterdir()) == ["drive", "full", "out"]
 
 
-def test_folders_are_overwritten(call, tmp_path):
-    source = kitti(tmp_path / "drive")
-    label(source, tmp_path / "out")
-    run(call, tmp_path / "out", tmp_path / "clean")
-    (tmp_path / "clean/velodyne/000009.bin").write_bytes(b"")
-    run(call, tmp_path / "out", tmp_path / "clean", "--overwrite")
-    assert not (tmp_path / "clean/velodyne/000009.bin").exists()
-
-
 def test_links_to_other_places_stay_links(call, tmp_path):
     """Linked folders of scans are written, others are not copied."""
     real = kitti(tmp_path / "real")
@@ -142,22 +130,3 @@ def test_options_of_reading_do_not_move_rows(call, tmp_path, options):
             gone = blank[recording.beams_of(used.index(k))]
             expected = rows.reshape(-1, 16)[~gone].tobytes()
         assert (tmp_path / f"clean/velodyne/{k:06d}.bin").read_bytes() == expected
-
-
-@pytest.mark.slow
-def test_interrupted_copies_leave_nothing(start, tmp_path):
-    (tmp_path / "pcd").mkdir()
-    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\n"
-    head += "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {0}\nDATA ascii\n"
-    lines = 20000 * "1.5 2.25 0.125\n"
-    for k in range(60):  # a second of writing
-        (tmp_path / f"pcd/{k}.pcd").write_text(head.format(20000) + lines)
-    label(tmp_path / "pcd", tmp_path / "out")
-    (tmp_path / "there").mkdir()
-    process = start("filter", tmp_path / "out", "-o", tmp_path / "there/clean", "--quiet")
-    while process.poll() is None and not list((tmp_path / "there").glob(".*.part")):
-        time.sleep(0.001)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 130, said
-    assert not list((tmp_path / "there").iterdir())

@@ -65,16 +65,6 @@ def test_las(call, tmp_path, name, version, point_format, single):
     check_same_but(recording, out, blank)
 
 
-def test_las_is_packed_by_its_name(call, tmp_path):
-    laspy = pytest.importorskip("laspy")
-    las_file(tmp_path / "a.las")
-    recording, blank = label(tmp_path / "a.las", tmp_path / "out")
-    run(call, tmp_path / "out", tmp_path / "clean.laz")
-    with laspy.open(tmp_path / "clean.laz") as file:
-        assert file.header.are_points_compressed
-    check_same_but(recording, tmp_path / "clean.laz", blank)
-
-
 def e57_file(path):
     pye57 = pytest.importorskip("pye57")
     with pye57.E57(str(path), "w") as file:

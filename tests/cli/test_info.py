@@ -174,11 +174,6 @@ def test_beam_times(path, tmp_path, capsys):
     assert found["beam_times_s"] == pytest.approx([-0.05, 0.1])
 
 
-def test_no_scan(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
-        run(tmp_path / "missing.log")
-
-
 def test_poses_and_images(path, tmp_path, capsys):
     recording = read(path)
     run(path)
@@ -247,11 +242,3 @@ def test_cameras_from_a_file(tmp_path, capsys):
     file.write_text("[image_3]\n")
     with pytest.raises(InputError, match="nearest: 'image_2'"):
         run(folder, "--cameras", str(file))
-
-
-def test_clouds_made_in_python(tmp_path, capsys):
-    """Their sensor's place on the robot has no coordinates in the plane."""
-    clouds = [np.ones((3, 3)), 2.0 * np.ones((2, 3))]
-    write(Recording.from_clouds([0.0, 0.1], clouds), tmp_path / "clouds")
-    assert run(tmp_path / "clouds") == 0
-    assert "min 2, median 2, max 3" in capsys.readouterr().out

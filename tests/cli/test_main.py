@@ -1,6 +1,5 @@
 """Exit statuses, one-line errors, closed pipes."""
 
-import json
 import os
 import subprocess
 
@@ -42,17 +41,6 @@ def test_bad_call_is_one_line(words, said, capsys):
     assert err.count("\n") == 1
     assert said in err
     assert "--help" in err
-
-
-def test_only_json_on_stdout(stillmap, tmp_path):
-    # a damaged line is reported, but not there
-    log = tmp_path / "some.log"
-    scan = "FLASER 3 1.0 1.0 1.0 0 0 0 0 0 0 {} host {}\n"
-    log.write_text(scan.format(1.0, 1.0) + "FLASER 3 1.0\n" + scan.format(2.0, 2.0))
-    done = stillmap("info", log, "--json")
-    assert done.returncode == 0
-    assert done.stdout.startswith("{")
-    assert json.loads(done.stdout)["scans"] == 2
 
 
 def test_reader_that_closes_early_is_no_error(stillmap, room):

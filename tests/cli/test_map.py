@@ -81,7 +81,7 @@ def test_progress_lines_without_terminal(mapped):
     assert re.search(r"40 of 40 scans, \d+/s", done.stderr)
     assert "\x1b" not in done.stderr
     assert "\r" not in done.stderr
-    assert re.search(r": (kept iteration [12] of 2|converged after one iteration)\b", done.stderr)
+    assert re.search(r": kept iteration [12] of [12]\b", done.stderr)
     assert re.search(r": quality \d+ of 100: labels \d+, geometry \d+\n", done.stderr)
     assert str(mapped[0] / "report.html") in lines[-2]
     assert lines[-1] == f"stillmap: see it over time: stillmap view {mapped[0]}"
@@ -194,20 +194,6 @@ def test_depth_images_need_poses(call, tmp_path, nothing_left, stated):
     write(recording, tmp_path / "depth")
     done = call("map", tmp_path / "depth", "-o", nothing_left)
     refused(done, "depth images", "--poses recording" if stated else "--poses FILE.tum")
-
-
-def test_poses_may_be_unsorted_more_and_rounded(call, room, tmp_path):
-    lines = (room / "truth/trajectory.tum").read_text().splitlines()
-    rounded = [re.sub(r"^(\d+\.\d\d)\d*", r"\1", line) for line in lines]
-    more = ["# a comment", "", "0 9 9 9 0 0 0 1", *rounded[::-1]]
-    (tmp_path / "poses.tum").write_text("\n".join(more))
-    words = ("map", room, "-o", tmp_path / "out", "--poses", tmp_path / "poses.tum", *QUICK)
-    assert call(*words).returncode == 0
-    np.testing.assert_allclose(
-        read_tum(tmp_path / "out/trajectory.tum")[1],
-        read_tum(room / "truth/trajectory.tum")[1],
-        atol=1e-8,
-    )
 
 
 def test_poses_that_do_not_match_are_refused(call, room, tmp_path, nothing_left):

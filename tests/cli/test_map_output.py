@@ -6,7 +6,7 @@ import shlex
 import shutil
 
 import pytest
-from maps import ENDLESS, FILES, QUICK, TWO_ITERATIONS, list_files
+from maps import FILES, QUICK, TWO_ITERATIONS, list_files
 from refusals import refused
 
 import stillmap.results.writer
@@ -39,21 +39,6 @@ def test_recording_is_not_overwritten(call, room, tmp_path):
     for more in ("--overwrite", "--resume"):
         refused(call("map", recording, "-o", tmp_path / "in", more, *QUICK), "holds the recording")
     assert list_files(recording) == before
-
-
-def test_unwritable_folder_is_refused_before_the_work(call, room, tmp_path):
-    (tmp_path / "file").write_text("")
-    places = [tmp_path / "file/out"]
-    if os.geteuid() != 0:  # root may write everywhere
-        (tmp_path / "closed").mkdir(mode=0o555)
-        places.append(tmp_path / "closed/out")
-    for place in places:
-        refused(call("map", room, "-o", place, *ENDLESS), place, "cannot be written")
-
-
-@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no /proc here")
-def test_failed_write_is_refused_after_the_work(call, room):
-    refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")
 
 
 @pytest.mark.parametrize("step", ["render_report", "write_labels", "write_json"])

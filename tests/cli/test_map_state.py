@@ -70,12 +70,3 @@ def test_other_estimators_have_no_changes(mapped, estimator):
     np.testing.assert_array_equal(p, same)
     assert told["changes"] == []
     assert not changed.any()
-
-
-def test_change_detection_off(mapped):
-    p, changed, told = mapped("--set", "em.change_detection=false")
-    assert told["changes"] == []
-    assert not changed.any()
-    assert "changing" not in told["learned"]
-    assert "changing" in mapped()[2]["learned"]
-    assert np.isfinite(p).any()

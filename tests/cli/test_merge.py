@@ -149,26 +149,3 @@ def test_interrupted(start, flat_days, hall, tmp_path, number, status):
     assert process.returncode == status
     assert "Traceback" not in err
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="mounting needs root")
-@pytest.mark.slow
-def test_a_disk_that_is_full(start, flat_days, flat_place, tmp_path):
-    import subprocess
-
-    small = tmp_path / "small"
-    small.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", small], capture_output=True
-    )
-    if mounted.returncode:
-        pytest.skip("no tmpfs can be mounted here")
-    try:
-        process = start("merge", flat_place, flat_days / "map3", "-o", small / "out", *QUICK)
-        _, err = process.communicate(timeout=60)
-        assert process.returncode == 2
-        assert err.count("\n") == 1
-        assert "No space left" in err
-        assert os.listdir(small) == []
-    finally:
-        subprocess.run(["umount", small], check=True)

@@ -130,16 +130,6 @@ def test_one_beam_of_ten_kilometres(map_it, changed):
     assert np.prod(size_of_map(out)) < 1e6
 
 
-def test_beams_of_kilometres_are_left_out_with_a_warning(map_it, changed):
-    def change(points):
-        points[::2] *= 1000.0
-
-    status, said, peak, out = map_it(changed("points", change))
-    assert (status, said) == (0, [])
-    assert peak < MOST
-    assert any("100 m" in w for w in json.loads((out / "run.json").read_text())["warnings"])
-
-
 def test_what_was_computed_is_resumed(room, tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise MemoryError("std::bad_alloc")

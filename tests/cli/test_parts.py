@@ -12,9 +12,7 @@ import stillmap
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
 from stillmap.pipeline import result
-from stillmap.pipeline.checkpoint import identify_run
 from stillmap.pipeline.em_loop import iterate
-from stillmap.pipeline.inputs import read as read_run
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow, select_time
 
@@ -116,13 +114,6 @@ def test_a_result_of_parts_finds_them_again(call, room, mapped_parts, tmp_path):
         _ = stillmap.load(out, recording=moved[:1]).recording
 
 
-def test_filter_refuses_to_write_into_a_part(call, mapped_parts):
-    out, parts = mapped_parts
-    for part in parts:
-        done = call("filter", out, "-o", part, "--overwrite")
-        refused(done, part, "is the recording itself")
-
-
 def test_the_window_counts_from_the_start_of_the_whole(call, room, tmp_path):
     window = ("--from", "1.5", "--to", "4")
     parts = cut_folder(room, tmp_path)
@@ -134,15 +125,6 @@ def test_the_window_counts_from_the_start_of_the_whole(call, room, tmp_path):
         stillmap.load(tmp_path / "b").recording.points,
         stillmap.load(tmp_path / "a").recording.points,
     )
-
-
-def test_given_poses_are_those_of_all_parts(call, room, tmp_path):
-    parts = cut_folder(room, tmp_path)
-    assert call("map", room, "-o", tmp_path / "a", *QUICK).returncode == 0
-    poses = tmp_path / "a" / "trajectory.tum"
-    done = call("map", *parts, "-o", tmp_path / "b", "--poses", poses, *QUICK)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "b" / "trajectory.tum").read_bytes() == poses.read_bytes()
 
 
 def test_an_interrupted_run_of_parts_continues(call, room, tmp_path, monkeypatch):
@@ -167,22 +149,6 @@ def test_an_interrupted_run_of_parts_continues(call, room, tmp_path, monkeypatch
     assert "continues after iteration 1" in done.stderr
     assert "3 parts of one run" in done.stderr
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-
-
-def test_a_run_is_identified_by_all_its_parts(room, tmp_path):
-    parts = cut_folder(room, tmp_path)
-    options = stillmap.Options()
-    whole, joined, fewer = (
-        identify_run(read_run(paths), options, None) for paths in (room, parts, parts[:0:-1])
-    )
-    assert whole == joined != fewer
-
-
-def test_python_takes_a_list(room, tmp_path):
-    parts = cut_folder(room, tmp_path)
-    built = stillmap.build(parts, {"em.max_iterations": 1}, resolution=0.2)
-    assert built.recording.n_scans == 40
-    assert repr(stillmap.read([room])) == repr(stillmap.read(room))
 
 
 def test_sessions_are_refused_and_merge_named(call, room, day_after, tmp_path, nothing_left):

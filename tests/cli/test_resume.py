@@ -77,20 +77,6 @@ def interrupted(call, room, tmp_path, stop_after):
     return tmp_path / ".out.resume"
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_result_equals_that_of_an_uninterrupted_run(
-    call, room, tmp_path, stop_after, whole, number
-):
-    stop_after(number)
-    assert call("map", room, "-o", tmp_path / "out", *WORDS).returncode == 130
-    stop_after(ALL)
-    done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
-    assert done.returncode == 0, done.stderr
-    assert f"continues after iteration {number}" in done.stderr
-    assert contents(tmp_path / "out") == contents(whole)
-    assert os.listdir(tmp_path) == ["out"]
-
-
 def test_repeated_interruptions(call, room, tmp_path, stop_after, whole):
     stop_after(1)
     for _ in range(ALL - 1):
@@ -168,14 +154,6 @@ def test_another_recording_is_refused(call, room, tmp_path, interrupted):
     assert interrupted.exists()
 
 
-def test_moved_recording_resumes(call, room, tmp_path, interrupted):
-    shutil.copytree(room, tmp_path / "moved")
-    done = call("map", tmp_path / "moved", "-o", tmp_path / "out", "--resume", *WORDS)
-    assert done.returncode == 0
-    assert "continues after iteration 2" in done.stderr
-    assert not interrupted.exists()
-
-
 def test_resume_with_other_threads(call, room, tmp_path, interrupted, whole):
     words = (*WORDS[:-1], "2")
     assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
@@ -205,12 +183,6 @@ def test_concurrent_runs_into_one_folder(call, room, tmp_path, interrupted):
     assert done.stderr.count("\n") == 1
     assert "another run" in done.stderr
     assert (interrupted / "iteration-2").exists()
-
-
-def test_bad_input_leaves_nothing(call, tmp_path):
-    done = call("map", tmp_path / "none.log", "-o", tmp_path / "a/b/out", *WORDS)
-    assert done.returncode == 2
-    assert os.listdir(tmp_path) == []
 
 
 class _Full:

@@ -93,16 +93,6 @@ def test_killed_while_writing(start, room, tmp_path, delay):
     assert not out.exists() or list_files(out) >= FILES
 
 
-def test_killed_while_overwriting(start, room, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "run.json").write_text("old")
-    process = start("map", room, "-o", out, "--overwrite", "--quiet", *QUICK)
-    status = stopped_while_writing(process, tmp_path, signal.SIGKILL)
-    assert status in (-signal.SIGKILL, 0)
-    assert list_files(out) == {"run.json"} or list_files(out) >= FILES
-
-
 GREEDY = """
 import signal, time
 try:

@@ -4,7 +4,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import sys
 import time
 import urllib.error
@@ -120,17 +119,6 @@ def test_opens_browser_of_the_environment(start, mapped, browser):
     with pytest.raises(urllib.error.HTTPError, match="403") as caught:
         urllib.request.urlopen(without_token, timeout=10)
     caught.value.close()
-    assert ended(process)[0] == 0
-
-
-def test_port(start, mapped):
-    pytest.importorskip("viser")
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        port = one.getsockname()[1]
-    process = start("view", mapped, "--port", port, env=without_a_screen())
-    address, _ = served(process)
-    assert f":{port}/" in address
     assert ended(process)[0] == 0
 
 

@@ -272,27 +272,6 @@ def test_fault(call, inputs, tmp_path, writer, fault):
     _check_what_is_left(left, done, output)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in FAULTS if name not in ("vanishes", "mount")])
-def test_fleet(call, room, tmp_path, name):
-    """Its tasks run in processes of their own, where faults cannot be set from here."""
-    fault = FAULTS[name]
-    with fault.make(tmp_path, fault.stem, Writer(())) as output:
-        known = _names(tmp_path)
-        done = call("fleet", room, "-o", output, "--quiet", *QUICK)
-        assert done.returncode in fault.statuses, done.stderr
-        if done.returncode == 0:
-            assert (output / "fleet.html").is_file()
-            assert os.listdir(output / "results") == ["room"]
-        else:
-            lines = done.stderr.splitlines()
-            assert len(lines) == 1
-            assert lines[0].startswith("stillmap: ")
-        left = {one.split("/")[0] for one in _names(tmp_path) - known}
-    # what a fleet has noted stays: the same command goes on
-    assert left <= {output.name, "disk"}
-
-
 def _stamps(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
 

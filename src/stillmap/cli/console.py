@@ -202,7 +202,8 @@ def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
     return False
 
 
-_ARGUMENT = re.compile(r"(?<![\w.])([a-z_]+)=(True\b|False\b|(?=\S))")  # in a hint for Python
+# an argument in a hint for Python: of yes or no, a text, or another
+_ARGUMENT = re.compile(r"(?<![\w.])([a-z_]+)=(?:(True|False)\b|\"([^\"]*)\"|(?=\S))")
 _FLAGS = {"recording": "input", "name": "to"}  # of arguments with another name
 
 
@@ -211,8 +212,9 @@ def in_flags(error: InputError) -> InputError:
 
     def to_flag(argument: re.Match[str]) -> str:
         flag = _FLAGS.get(argument[1], argument[1]).replace("_", "-")
-        ends = {"True": f"--{flag}", "False": f"--no-{flag}", "": f"--{flag} "}
-        return ends[argument[2]]
+        if argument[2]:
+            return f"--{flag}" if argument[2] == "True" else f"--no-{flag}"
+        return f"--{flag} {argument[3] or ''}"
 
     hint = _ARGUMENT.sub(to_flag, error.hint)
     return InputError(error.what, where=error.where, hint=hint)

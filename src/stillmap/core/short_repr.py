@@ -33,5 +33,7 @@ def _describe(value: Any) -> str:
         return f"<{dtype} {tuple(shape)}>"
     if isinstance(value, list | dict | tuple | set | frozenset) and len(value) > _MAX_ITEMS:
         return f"<{type(value).__name__} of {len(value)}>"
+    if dataclasses.is_dataclass(value):
+        return f"{type(value).__name__}(...)"
     text = repr(value.item() if shape == () else value)
     return text if len(text) <= _MAX_LENGTH else f"<{type(value).__name__}>"
