@@ -86,20 +86,6 @@ def test_parent_folders_are_created(call, room, mapped, tmp_path, nothing_left, 
     nothing_left("conv")
 
 
-def test_unwritable_output_is_named(call, room, tmp_path, monkeypatch):
-    """Where nobody may write; root may nearly everywhere."""
-
-    def denied(*_, **__):
-        raise PermissionError(13, "Permission denied", f"{tmp_path}/rhh5gxx6.part")
-
-    monkeypatch.setattr("stillmap.core.files.temporary_folder", denied)
-    for name in ("x.log", "new/x.log"):
-        done = call("convert", room, "-o", tmp_path / name)
-        refused(done, f"{tmp_path / name}: cannot be written: Permission denied")
-        assert "rhh5gxx6" not in done.stderr
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "a"])
 def test_result_as_bag(call, mapped, tmp_path, nothing_left, name):
     to = ["--to", "ros2"] if name == "a" else []

@@ -63,17 +63,6 @@ def test_filtered_bag(call, room, tmp_path):
     assert call("filter", tmp_path / "out", "-o", tmp_path / "clean.bag", *same).returncode == 0
 
 
-def test_logs_of_any_name(call, room, tmp_path):
-    assert call("convert", room, "-o", tmp_path / "a.clf", "--quiet").returncode == 0
-    (tmp_path / "a.clf").rename(tmp_path / "log of the hall")
-    done = call("map", tmp_path / "log of the hall", "-o", tmp_path / "out", *QUICK)
-    assert done.returncode == 0, done.stderr
-    for name in ("clean.log", "clean.txt.gz", "clean", "clean.of-the-hall"):
-        done = call("filter", tmp_path / "out", "-o", tmp_path / name)
-        assert done.returncode == 0, done.stderr
-        assert read(tmp_path / name).n_scans == read(room).n_scans
-
-
 @pytest.mark.parametrize("output", ["c.bag", "c.mcap", "c.db3", "c.log", "c.clf.gz", "c:ros2"])
 def test_other_formats_by_name(call, room, mapped, tmp_path, output):
     """Blanked beams become misses."""
@@ -111,18 +100,6 @@ def test_refusals(call, room, mapped, tmp_path):
         refused(call("filter", mapped, "-o", tmp_path / "full", *more), said)
     assert (tmp_path / "full/file").exists()
     assert not (tmp_path / "c").exists()
-
-
-def test_inputs_are_never_overwritten(call, room, mapped, tmp_path):
-    shutil.copytree(room, tmp_path / "all/room")
-    (tmp_path / "all/precious").write_text("")
-    given = ("--input", tmp_path / "all/room/recording.json", "--overwrite")
-    for output, words in (("room", "the recording itself"), (".", "holds the recording")):
-        refused(call("filter", mapped, "-o", tmp_path / "all" / output, *given), words)
-    refused(call("filter", mapped, "-o", mapped, *given), "holds the recording or the result")
-    assert (tmp_path / "all/precious").exists()
-    before, after = stillmap_folder.read(room), stillmap_folder.read(tmp_path / "all/room")
-    np.testing.assert_array_equal(before.hit, after.hit)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from recordings import of_one_sensor
 
-from stillmap.cli import recording_info as module
 from stillmap.cli.parser import parser
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
@@ -161,19 +159,6 @@ def test_3d_recording(tmp_path, capsys, scans):
     assert run(tmp_path / "rec", "--json") == 0
 
 
-def test_beam_times(path, tmp_path, capsys):
-    recording = read(path)
-    run(path)
-    assert "beam times" not in capsys.readouterr().out
-    times = np.linspace(-0.05, 0.1, recording.n_beams).astype(np.float32)
-    write(replace(recording, beam_time=times), tmp_path / "rec")
-    assert run(tmp_path / "rec") == 0
-    assert "-0.05, 0.1 s" in capsys.readouterr().out
-    assert run(tmp_path / "rec", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["beam_times_s"] == pytest.approx([-0.05, 0.1])
-
-
 def test_poses_and_images(path, tmp_path, capsys):
     recording = read(path)
     run(path)
@@ -188,9 +173,12 @@ def test_poses_and_images(path, tmp_path, capsys):
     )
     stamp_ns, camera = np.arange(5, dtype=np.int64), np.array([0, 1, 0, 0, 1], np.int32)
     images = Images(stamp_ns, camera, cameras, lambda _: np.zeros((6, 8), np.uint8))
-    write(replace(recording, T_recorded_base=T, images=images), tmp_path / "rec")
+    times = np.linspace(-0.05, 0.1, recording.n_beams).astype(np.float32)
+    changes = {"T_recorded_base": T, "images": images, "beam_time": times}
+    write(replace(recording, **changes), tmp_path / "rec")
     run(tmp_path / "rec")
     out = capsys.readouterr().out
+    assert "-0.05, 0.1 s" in out
     assert re.search("recorded poses +path length 7 m, turned 0 deg", out)
     assert re.search("count +5\n +usable +0\n +left out +of a 2D recording 5", out)
     words = "name front, count 3, usable 0, width 8, height 6, calibrated yes, placed yes"
@@ -200,26 +188,6 @@ def test_poses_and_images(path, tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
     assert (found["images"]["count"], found["images"]["cameras"][1]["count"]) == (5, 2)
-
-
-def test_ranges_of_huge_recordings_are_sampled(monkeypatch):
-    counts = np.full(400, 50)
-    rng = np.random.default_rng(0)
-    points = np.zeros((20_000, 2), np.float32)
-    points[:, 0] = rng.uniform(1, 11, 20_000)
-    recording = of_one_sensor(
-        np.arange(400, dtype=np.int64),
-        np.concatenate([[0], np.cumsum(counts)]),
-        points,
-        np.ones(20_000, bool),
-    )
-    exact = module.summarize_recording(recording)
-    assert exact["hit_ranges_m"]["max"] == pytest.approx(points.max(), abs=1e-4)
-    monkeypatch.setattr(module, "_MAX_SAMPLE", 2000)
-    assert len(module._sample_hit_ranges(recording)) <= 2000
-    sampled = module.summarize_recording(recording)
-    assert sampled["hit_ranges_m"]["median"] == pytest.approx(6.0, abs=0.3)
-    assert sampled["counts"] == exact["counts"]
 
 
 def test_cameras_from_a_file(tmp_path, capsys):

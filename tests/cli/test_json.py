@@ -44,14 +44,6 @@ def test_map(mapped):
     assert "report.html" in done.stderr
 
 
-def test_filter(call, mapped, room, tmp_path):
-    done = call("filter", mapped[0], "-o", tmp_path / "clean", "--json", "--quiet")
-    found = parsed(done)
-    assert done.stderr == ""
-    assert (found["output"], found["input"]) == (str(tmp_path / "clean"), str(room))
-    assert 0 < found["blanked"] < found["hits"]
-
-
 def test_config(call):
     found = parsed(call("config", "--json", "--set", "em.prior=0.75"))
     assert list(found) == [one.name for one in iter_options(Options())]

@@ -106,15 +106,6 @@ def test_same_bytes_for_any_number_of_threads(call, room, mapped, tmp_path, thre
     same_result(mapped[0], tmp_path / "out")
 
 
-def test_same_bytes_with_given_poses(call, room, tmp_path):
-    outs = [tmp_path / name for name in ("a", "b", "c")]
-    for out, threads in zip(outs, (1, 1, 2), strict=True):
-        words = ("--poses", room / "truth/trajectory.tum", "--threads", threads)
-        assert call("map", room, "-o", out, *words).returncode == 0
-    same_result(outs[0], outs[1])
-    same_result(outs[0], outs[2])
-
-
 def test_reader_warnings_are_printed_and_kept(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
     content = (tmp_path / "a.bag").read_bytes()
@@ -132,13 +123,6 @@ def test_non_recording_is_refused(call, tmp_path, nothing_left, content):
     (tmp_path / "input.log").write_text(content)
     refused(call("map", tmp_path / "input.log", "-o", tmp_path / "out"), "input.log")
     nothing_left("input.log")
-
-
-def test_2d_estimator_refuses_3d(call, tmp_path, nothing_left):
-    (tmp_path / "sweep.pcd").write_text(PCD)
-    done = call("map", tmp_path / "sweep.pcd", "-o", tmp_path / "out", "--estimator", "tracker")
-    refused(done, "is 3D", "'tracker'", "--estimator stillmap or paper")
-    nothing_left("sweep.pcd")
 
 
 def test_no_odometry(call, room, tmp_path):

@@ -60,13 +60,3 @@ def test_states_differ_at_the_crate(mapped):
     assert (last[came] > 0.65).mean() > 0.5
     assert (most[came] < 0.196).mean() > 0.8
     np.testing.assert_array_equal(np.isnan(last), np.isnan(most))
-
-
-@pytest.mark.parametrize("estimator", ["paper", "hit-ratio"])
-def test_other_estimators_have_no_changes(mapped, estimator):
-    words = ("--estimator", estimator, "--set", "em.max_iterations=1")
-    p, changed, told = mapped(*words, "--map-state", "majority")
-    same, *_ = mapped(*words)
-    np.testing.assert_array_equal(p, same)
-    assert told["changes"] == []
-    assert not changed.any()

@@ -120,16 +120,6 @@ def test_odometry_that_leaps(map_it, changed, leap):
     )
 
 
-def test_one_beam_of_ten_kilometres(map_it, changed):
-    def change(points):
-        points[1000] *= 1e4 / np.linalg.norm(points[1000])
-
-    status, said, peak, out = map_it(changed("points", change))
-    assert (status, said) == (0, [])
-    assert peak < MOST
-    assert np.prod(size_of_map(out)) < 1e6
-
-
 def test_what_was_computed_is_resumed(room, tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise MemoryError("std::bad_alloc")

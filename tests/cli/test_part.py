@@ -98,15 +98,3 @@ def test_a_region_limits_the_map_and_neither_poses_nor_labels(call, room, tmp_pa
     walls = [json.loads(call("eval", "map", out, room, "--json").stdout) for out in (whole, part)]
     assert walls[1]["reference_wall_cells"] < 0.8 * walls[0]["reference_wall_cells"]
     assert walls[1]["walls_kept"] > 0.9  # those outside are not missed
-
-
-def test_regions_that_cannot_be(call, room, tmp_path, nothing_left):
-    for words, said in (
-        ((2, 0, 1, 1), "x0 < x1 and y0 < y1, got 2 0 1 1"),
-        ((0, 0, "nan", 1), "must be a finite number, got nan"),
-    ):
-        done = call("map", room, "-o", tmp_path / "out", "--region", *words)
-        refused(done, "output.region", said)
-    nothing_left()
-    done = call("map", room, "-o", tmp_path / "out", "--region", 50, 50, 60, 60, *QUICK)
-    refused(done, "50 50 60 60 lies outside the map", "the map spans 0.05 to 6.55 m in x")

@@ -53,7 +53,8 @@ def stop_after(monkeypatch):
     return stop
 
 
-def test_the_command_that_is_told_continues(call, room, tmp_path, stop_after):
+def test_the_command_that_is_told_continues(call, room, tmp_path, stop_after, whole):
+    """The result equals that of an uninterrupted run."""
     stop_after(2)
     out = tmp_path / "the map"
     stopped = call("map", room, "-o", out, "--overwrite", *WORDS)
@@ -63,6 +64,8 @@ def test_the_command_that_is_told_continues(call, room, tmp_path, stop_after):
     done = call(*shlex.split(told))
     assert done.returncode == 0, done.stderr
     assert "continues after iteration 2" in done.stderr
+    assert contents(out) == contents(whole)
+    assert os.listdir(tmp_path) == ["the map"]
 
 
 @pytest.fixture
@@ -154,13 +157,15 @@ def test_another_recording_is_refused(call, room, tmp_path, interrupted):
     assert interrupted.exists()
 
 
-def test_resume_with_other_threads(call, room, tmp_path, interrupted, whole):
+def test_moved_recording_resumes_with_other_threads(call, room, tmp_path, interrupted, whole):
+    shutil.copytree(room, tmp_path / "room")
     words = (*WORDS[:-1], "2")
-    assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
+    done = call("map", tmp_path / "room", "-o", tmp_path / "out", "--resume", *words)
+    assert "continues after iteration 2" in done.stderr
     assert not interrupted.exists()
     mine, theirs = contents(tmp_path / "out"), contents(whole)
     differ = {name for name in theirs if mine[name] != theirs[name]}
-    assert differ <= {"run.json", "report.html"}  # they name the number of threads
+    assert differ <= {"run.json", "report.html"}  # they name the recording and the threads
 
 
 @pytest.mark.parametrize(

@@ -33,18 +33,6 @@ def test_recording_reads_back_with_truth(tmp_path: Path) -> None:
     assert json.loads((out / "truth/scene.json").read_text())["name"] == "hall"
 
 
-def test_files_of_the_folder(tmp_path: Path) -> None:
-    call("corridor", "-o", str(tmp_path / "sim"), *QUICK)
-    names = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
-    arrays = ["stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor", "T_odom_base"]
-    truth = "static.npy mover.npy movers.npy T_world_base.npy walls.npy trajectory.tum scene.json"
-    assert names == {
-        "sim/recording.json",
-        *(f"sim/{name}.npy" for name in arrays),
-        *(f"sim/truth/{name}" for name in truth.split()),
-    }
-
-
 def test_sessions_are_recordings_with_truth_in_common(tmp_path: Path, capsys) -> None:
     out = tmp_path / "days"
     assert call("lookalike-1", "-o", str(out), *QUICK, "--sessions", "2", "--json") == 0
@@ -105,17 +93,6 @@ def test_any_option_can_be_set_and_flags_win(tmp_path: Path) -> None:
     assert len(read.T_base_sensor) == 2
 
 
-def test_a_lidar_records_in_3d(tmp_path: Path) -> None:
-    flags = "--lidar 16 --scans 4 --people 3 --rate 5 --max-range 20 --set lidar.columns=90"
-    call("hall", "-o", str(tmp_path / "sim"), *flags.split())
-    read, truth = io.read(tmp_path / "sim"), load_truth(tmp_path / "sim")
-    assert (read.dimension, read.n_beams) == (3, 4 * 16 * 90)
-    assert read.stamp_ns[1] - read.stamp_ns[0] == 200_000_000
-    assert np.linalg.norm(read.points, axis=1).max() == pytest.approx(20.0)
-    assert truth.scene["lidar"]["channels"] == 16
-    assert len(truth.static) == read.n_beams
-
-
 def test_tilting_laser_makes_two_recordings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -143,15 +120,6 @@ def test_laser_options_are_refused_for_lidar(tmp_path: Path, flags: str, what: s
     with pytest.raises(InputError, match=what):
         call("hall", "-o", str(tmp_path / "sim"), *flags.split())
     assert not (tmp_path / "sim").exists()
-
-
-def test_scenes_with_vehicles(tmp_path: Path) -> None:
-    call("office", "-o", str(tmp_path / "sim"), *QUICK)
-    truth = load_truth(tmp_path / "sim")
-    doors = truth.scene["mover_kinds"].count("door")
-    assert truth.scene["mover_kinds"] == ["person"] * 3 + ["door"] * doors
-    assert doors == len(truth.scene["leaves"]) > 10
-    assert truth.movers.shape == (20, 3 + doors, 3)
 
 
 def test_carmen_log_equals_recording_folder(tmp_path: Path) -> None:
@@ -196,21 +164,6 @@ def test_values_out_of_range_are_refused(tmp_path: Path, flags: list[str], messa
     with pytest.raises(InputError, match=message):
         call("hall", "-o", str(tmp_path / "sim"), *flags)
     assert not list(tmp_path.iterdir())
-
-
-def test_non_empty_folder_is_refused(tmp_path: Path) -> None:
-    out = tmp_path / "sim"
-    out.mkdir()
-    (out / "mine").write_text("x")
-    with pytest.raises(InputError, match="already holds something"):
-        call("hall", "-o", str(out), *QUICK)
-    with pytest.raises(InputError, match="holds other things"):
-        call("hall", "-o", str(out), *QUICK, "--overwrite")
-    assert (out / "mine").read_text() == "x"
-    (out / "truth").mkdir()
-    assert call("hall", "-o", str(out), *QUICK, "--overwrite") == 0
-    assert (out / "recording.json").exists()
-    assert not (out / "mine").exists()
 
 
 def test_summary_unless_quiet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

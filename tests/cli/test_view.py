@@ -133,13 +133,6 @@ def test_missing_recording_shows_no_beams(start, mapped, room, tmp_path):
     assert ended(process)[0] == 0
 
 
-def test_named_recording_must_exist(call, mapped, tmp_path):
-    pytest.importorskip("viser")
-    done = call("view", mapped, "--input", tmp_path / "nothing")
-    assert done.returncode == 2
-    assert "nothing" in done.stderr
-
-
 def test_damaged_result_is_refused(call, mapped, tmp_path):
     pytest.importorskip("viser")
     out = shutil.copytree(mapped, tmp_path / "out")

@@ -144,13 +144,6 @@ def _link(folder: Path, name: str, _: Writer) -> Iterator[Path]:
 
 
 @contextmanager
-def _loop(folder: Path, name: str, _: Writer) -> Iterator[Path]:
-    (folder / name).symlink_to(name)
-    yield folder / name
-    (folder / name).unlink()
-
-
-@contextmanager
 def _mount(folder: Path, name: str, writer: Writer) -> Iterator[Path]:
     """As if something was mounted there; tests/cli/test_mounts.py mounts indeed."""
     path = folder / name
@@ -173,14 +166,6 @@ def _mount(folder: Path, name: str, writer: Writer) -> Iterator[Path]:
 
 
 @contextmanager
-def _pipe(folder: Path, name: str, _: Writer) -> Iterator[Path]:
-    os.mkfifo(folder / name)
-    yield folder / name
-    assert (folder / name).is_fifo()
-    (folder / name).unlink()
-
-
-@contextmanager
 def _at(folder: Path, name: str, _: Writer) -> Iterator[Path]:
     yield folder / name
 
@@ -198,9 +183,7 @@ FAULTS = {
     "denied": Fault(_denied, statuses=(2,)),
     "vanishes": Fault(_vanishing, statuses=(2,)),
     "link": Fault(_link, statuses=(0,)),
-    "loop": Fault(_loop, statuses=(2,)),
     "mount": Fault(_mount, statuses=(0,)),
-    "pipe": Fault(_pipe, statuses=(2,)),
     "longest": Fault(_at, "n" * 255, (0,)),
     "too-long": Fault(_at, "n" * 256, (2,)),
     "no-utf8": Fault(_at, NO_UTF8),

@@ -11,8 +11,6 @@ from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.source import Source
 from stillmap.io import builder
 from stillmap.io.builder import RecordingBuilder
-from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.prepare import prepare
 
 
 @pytest.fixture
@@ -41,33 +39,6 @@ def test_a_column_is_what_was_added(limit, tmp_path, rng):
     assert list(tmp_path.iterdir()) == []  # a file without a name leaves nothing behind
 
 
-def test_new_arrays_keep_what_is_written(limit, tmp_path):  # noqa: ARG001
-    values = arrays.empty((40, 2), np.float32, tmp_path)
-    values[:] = np.arange(80).reshape(40, 2)
-    arrays.release_pages(values)
-    np.testing.assert_array_equal(values, np.arange(80).reshape(40, 2))
-
-
-def test_a_full_disk_is_an_error(monkeypatch):
-    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
-    full = Path("/dev/full")
-    if not full.exists():
-        pytest.skip("no /dev/full here")
-    with full.open("r+b", buffering=0) as file:
-        monkeypatch.setattr(arrays, "open_unlinked", lambda _: file)
-        with pytest.raises(OSError, match="No space left"):
-            ArrayBuilder(np.float32).append(np.ones(3))
-
-
-@pytest.mark.usefixtures("limit")
-def test_a_temporary_folder_that_is_gone(tmp_path):
-    gone = tmp_path / "stillmap-1" / "more"
-    column = ArrayBuilder(np.float32, (), gone)
-    column.append(np.arange(5))
-    np.testing.assert_array_equal(column.finish(), np.arange(5))
-    arrays.empty((7,), np.float64, gone)[:] = 1.0
-
-
 @pytest.mark.parametrize("block", [4, 1 << 20])
 def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # noqa: ARG001
     monkeypatch.setattr(builder, "_BLOCK", block)
@@ -80,16 +51,6 @@ def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # no
     np.testing.assert_array_equal(found.offset, [0, 0, 9, 13])
     np.testing.assert_array_equal(found.points, np.concatenate([scans[2], scans[0]]))
     np.testing.assert_allclose(found.beam_time, [0.2] * 9 + [0.3] * 4)
-
-
-def test_ranges_of_clouds():
-    gathered = RecordingBuilder(2, None)
-    x = [0.5, 2.0, 8.0, np.nan, np.inf, 0.0]
-    gathered.add_scan(0, np.stack([x, np.zeros(6)], axis=1))
-    raw = gathered.build(np.eye(3)[None], source=Source())
-    found = prepare(raw, ReadOptions(min_range=1.0, max_range=4.0))
-    np.testing.assert_array_equal(found.hit, [False, True, False, False, False, False])
-    np.testing.assert_array_equal(found.points[:, 0], [np.nan, 2.0, 4.0, np.nan, np.nan, np.nan])
 
 
 def resident() -> int:
@@ -116,13 +77,6 @@ def test_changes_of_a_copy_on_write_stay(tmp_path):
     values[:] = 7
     arrays.release_pages(values[100:].reshape(-1, 4))
     assert (values == 7).all()
-
-
-def test_blocks_are_all_rows_once(limit, tmp_path):  # noqa: ARG001
-    values = arrays.empty((10, 2), np.int64, tmp_path)
-    for block in arrays.iter_blocks(values, rows=4):
-        values[block] = block.start
-    assert values[:, 0].tolist() == [0] * 4 + [4] * 4 + [8] * 2
 
 
 @pytest.mark.parametrize("items", [0, 1, 7])

@@ -2,8 +2,6 @@
 
 import os
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -130,28 +128,6 @@ def test_arrays_that_cannot_be(tmp_path):
     os.truncate(tmp_path / "a.npy", 500)
     with pytest.raises(InputError, match=r"is damaged: no \(100,\) int64 follow its header"):
         open_npy(tmp_path / "a.npy")
-
-
-def test_recording_that_shrinks_while_it_is_mapped(tmp_path):
-    """A mapped file ends the process by SIGBUS."""
-    script = """
-import os, sys
-from pathlib import Path
-import numpy as np
-from stillmap.core import arrays
-from stillmap.core.array_folder import open_npy
-from stillmap.core.errors import InputError
-path = Path(sys.argv[1])
-np.save(path, np.ones(1 << 23))
-array = open_npy(path)
-os.truncate(path, 1000)
-arrays.release_pages(array)
-assert array.sum() == 1 << 23
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path / "a.npy")], check=False, timeout=60
-    )
-    assert done.returncode == 0
 
 
 def test_lock_that_is_a_link_leading_nowhere(tmp_path):

@@ -46,8 +46,3 @@ def test_zeros_of_a_receiver_without_a_fix():
     positions = np.tile(UTM, (20, 1))
     positions[:4] = 0.0
     np.testing.assert_array_equal(LocalFrame.near(poses_at(positions)).origin, UTM)
-
-
-def test_nothing_finite():
-    assert not LocalFrame.near(poses_at(np.full((3, 2), np.nan))).is_shifted
-    assert not LocalFrame.near(np.zeros((0, 3, 3))).is_shifted

@@ -30,13 +30,6 @@ def test_parameters_undo_matrix(pose):
     assert np.exp(1j * theta) == pytest.approx(np.exp(1j * pose[2]))
 
 
-@given(poses, poses)
-def test_inverse_of_a_product(a, b):
-    A, B = se2.matrix(*a), se2.matrix(*b)
-    np.testing.assert_allclose(se2.inverse(A) @ A, np.eye(3), atol=1e-9)
-    np.testing.assert_allclose(se2.inverse(A @ B), se2.inverse(B) @ se2.inverse(A), atol=1e-7)
-
-
 @given(lengths, lengths, st.floats(-3.1, 3.1))
 def test_log_undoes_the_exponential(x, y, theta):
     twist = np.array([[0.0, -theta, x], [theta, 0.0, y], [0.0, 0.0, 0.0]])

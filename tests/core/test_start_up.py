@@ -5,16 +5,6 @@ import sys
 
 import pytest
 
-
-@pytest.mark.parametrize(
-    "module", ["core.errors", "core.files", "core.config", "prepare.options", "cli.main"]
-)
-def test_numpy_is_not_imported(module):
-    code = f"import sys, stillmap.{module}; print('numpy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
-
-
 # each takes a tenth of a second or more to load, or leads to what does
 HEAVY = ("gtsam", "jinja2", "matplotlib", "rosbags", "scipy", "stillmap.mesh.build", "trimesh")
 

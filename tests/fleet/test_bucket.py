@@ -2,8 +2,6 @@
 
 import json
 import os
-import re
-import urllib.request
 
 import pytest
 from fleet_processes import NAMES
@@ -79,17 +77,6 @@ def fill(s3, **contents):
 LOGS_TO_OUT = ("s3://robots/logs", "-o", "s3://robots/out", "--quiet")
 
 
-def test_goes_on(stand_in, s3):
-    fill(s3, a="fine", b="bad")
-    assert stand_in(*LOGS_TO_OUT).returncode == 3
-    before = s3.info("robots/out/results/a/run.json")
-    fill(s3, b="fine", c="fine")
-    assert stand_in(*LOGS_TO_OUT).returncode == 0
-    assert s3.info("robots/out/results/a/run.json") == before
-    names = {one.split("/")[2] for one in listed(s3) if one.startswith("out/results")}
-    assert names == set("abc")
-
-
 def test_half_an_upload_is_no_result(stand_in, s3):
     fill(s3, a="fine")
     assert stand_in(*LOGS_TO_OUT).returncode == 0
@@ -99,16 +86,6 @@ def test_half_an_upload_is_no_result(stand_in, s3):
     assert stand_in(*LOGS_TO_OUT).returncode == 0
     names = [one.removeprefix("out/results/a/") for one in listed(s3) if "results/a/" in one]
     assert names == ["beams/stamp_ns.npy", "made.json", "map.npz", "run.json"]
-
-
-def test_places_are_merged(stand_in, s3):
-    fill(s3, a="fine", b="fine")
-    done = stand_in(*LOGS_TO_OUT, "--merge")
-    assert done.returncode == 0, done.stderr
-    sessions = json.loads(s3.cat("robots/out/places/all/sessions.json"))
-    assert [one["input"] for one in sessions] == [
-        f"s3://robots/out/results/{name}" for name in "ab"
-    ]
 
 
 def test_bucket_to_folder(stand_in, s3, tmp_path):
@@ -130,30 +107,6 @@ def test_manifest_and_missing_object(stand_in, s3, tmp_path):
     done = stand_in("--manifest", "s3://robots/logs/m.csv", "-o", tmp_path / "out", "--quiet")
     assert done.returncode == 3
     assert done.stderr == "stillmap: b: s3://robots/logs/b.clf: does not exist\n"
-
-
-@pytest.mark.usefixtures("s3")
-def test_bucket_without_access(call, s3_server, recordings, tmp_path):
-    with urllib.request.urlopen(_post(s3_server, b"0")):  # from now on keys are checked
-        pass
-    try:
-        for words in (
-            (recordings / "hall", "-o", "s3://robots/out"),
-            ("s3://robots/day", "-o", tmp_path / "out"),
-        ):
-            done = call("fleet", *words)
-            assert (done.returncode, done.stdout) == (2, "")
-            (line,) = done.stderr.splitlines()
-            assert re.match(r"stillmap: s3://robots/(out|day): cannot be read: ", line)
-    finally:
-        with urllib.request.urlopen(_post(s3_server, b"inf")):
-            pass
-    assert not (tmp_path / "out").exists()
-
-
-def _post(server, data):
-    headers = {"Content-Type": "text/plain"}
-    return urllib.request.Request(f"{server}/moto-api/reset-auth", data=data, headers=headers)
 
 
 def test_missing_library():

@@ -1,6 +1,5 @@
 """What a fleet does with its tasks; what the tasks do is a stand-in's."""
 
-import errno
 import fcntl
 import json
 import os
@@ -205,21 +204,6 @@ def test_two_fleets_in_one_folder(stand_in, logs, tmp_path):
     assert os.listdir(out) == [".lock"]
     assert stand_in(folder, "-o", out, "--quiet").returncode == 0
     assert sorted(os.listdir(out)) == ["fleet.html", "fleet.json", "results"]
-
-
-def test_bad_input_leaves_nothing(stand_in, tmp_path):
-    assert stand_in(tmp_path / "missing-*.bag", "-o", tmp_path / "a/b/out").returncode == 2
-    assert os.listdir(tmp_path) == []
-
-
-def test_folder_that_cannot_be_written(stand_in, logs, tmp_path, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-    monkeypatch.setattr("stillmap.fleet.run.hold_lock", refuse)
-    done = stand_in(logs(a="fine"), "-o", tmp_path / "out")
-    assert done.returncode == 2
-    assert done.stderr == f"stillmap: {tmp_path / 'out'}: cannot be written: Permission denied\n"
 
 
 @pytest.mark.parametrize(

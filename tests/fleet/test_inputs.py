@@ -7,7 +7,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFile
 
 from stillmap.core.errors import InputError
-from stillmap.fleet.inputs import Entry, find_sources, make_unique, read_manifest, short_name
+from stillmap.fleet.inputs import Entry, find_sources, read_manifest, short_name
 from stillmap.fleet.locations import absolute, fetch
 
 FLASER = "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 host 1.0\n"
@@ -41,14 +41,6 @@ def test_folder_that_is_a_recording_is_one(recordings):
     assert names(entries_of([str(recordings)], None)) == ["hall", "office", "yard"]
 
 
-def test_result_is_no_recording(logs):
-    result = logs / "result"
-    result.mkdir()
-    (result / "static.ply").write_text("ply\n")
-    (result / "run.json").write_text("{}")
-    assert names(entries_of([str(logs)], None)) == ["a", "b"]
-
-
 def test_pattern(logs):
     assert names(entries_of([f"{logs}/*"], None)) == ["a", "b", "deep"]
     assert names(entries_of([f"{logs}/?.log"], None)) == ["b"]
@@ -80,11 +72,6 @@ def test_names_are_unique_and_stay(tmp_path):
 )
 def test_short_name(text, expected):
     assert short_name(text) == expected
-
-
-def test_make_unique_ignores_case():
-    taken = set()
-    assert [make_unique(name, taken) for name in ("a", "A", "a-2")] == ["a", "A-2", "a-2-2"]
 
 
 @pytest.mark.parametrize("text", ["nothing://a", "s3://a/b::simplecache"])

@@ -56,16 +56,6 @@ def test_damaged_one_is_named(fleet):
     assert f"stillmap: damaged: {entry['why']}" in err.splitlines()
 
 
-def test_cost_is_noted(fleet):
-    out, _ = fleet
-    for one in json.loads((out / "fleet.json").read_text()):
-        if one["status"] == "done":
-            run = json.loads((out / one["result"] / "run.json").read_text())
-            peak = max(run["peak_memory_bytes"].values())
-            assert peak <= one["peak_memory_bytes"] < 2 * peak
-            assert one["cpu_seconds"] > sum(run["cpu_seconds"].values())
-
-
 def test_page_is_self_contained(fleet):
     out, _ = fleet
     text = (out / "fleet.html").read_text()

@@ -1,8 +1,6 @@
 """Errors of the package in the terms of Python, of the command line in those of the shell."""
 
 import dataclasses
-import os
-import subprocess
 import sys
 
 import numpy as np
@@ -76,24 +74,3 @@ def test_a_missing_library_is_named(built, monkeypatch, module, call):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(stillmap.MissingExtra, match=r"pip install .*\[notebook\]"):
         call(built)
-
-
-@pytest.mark.parametrize("backend", ["nonsense", "module://nonsense"])
-def test_plot_with_a_missing_backend(backend):
-    """As Jupyter sets MPLBACKEND for its children; one line, and own axes do without it."""
-    pytest.importorskip("matplotlib")
-    program = (
-        "from stillmap.core.errors import InputError\n"
-        "from stillmap.results.plot import _make_axes\n"
-        "try: _make_axes()\n"
-        "except InputError as error: print(str(error).count('\\n'), error)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ, "MPLBACKEND": backend},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.stdout.startswith("0 no plot can be drawn: "), done.stderr
-    assert "MPLBACKEND" in done.stdout

@@ -50,14 +50,6 @@ def test_readings_mean_what_they_mean_in_a_laser_scan():
     np.testing.assert_allclose(np.linalg.norm(points[far], axis=1), 3.5, rtol=1e-3)
 
 
-def test_a_code_of_the_maximum_range_is_recognised():
-    ranges = RANGES.copy()
-    ranges[:, ::7] = 29.99
-    recording = scans(ranges)
-    assert not recording.hit.reshape(T, N)[:, ::7].any()
-    assert recording.source.sensors[0].ranges.threshold == 29.99
-
-
 @pytest.mark.parametrize(
     "stamps",
     [

@@ -11,12 +11,6 @@ import stillmap
 FAST = {"threads": 2, "em.max_iterations": 2}
 
 
-def test_nothing_is_printed_unasked(folder, tmp_path, capfd):
-    stillmap.build(folder, FAST, resolution=0.2).save(tmp_path / "out")
-    stillmap.load(tmp_path / "out").to_arrow("poses")
-    assert capfd.readouterr() == ("", "")
-
-
 def test_a_bar_on_stderr(folder, capfd, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     stillmap.build(folder, FAST, resolution=0.2, progress=True)
@@ -66,23 +60,3 @@ def test_ctrl_c_while_saving_leaves_no_half_result(built, tmp_path, monkeypatch,
         built.save(out, overwrite=earlier)
     assert sorted(tmp_path.iterdir()) == ([out] if earlier else [])
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == files
-
-
-@pytest.mark.slow  # starts a kernel of Jupyter
-def test_a_notebook(folder, tmp_path):
-    nbclient = pytest.importorskip("nbclient")
-    nbformat = pytest.importorskip("nbformat")
-    pytest.importorskip("ipykernel")
-    cells = [
-        f"import stillmap\nresult = stillmap.build({str(folder)!r}, {FAST}, progress=True)",
-        "result",
-    ]
-    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
-    client = nbclient.NotebookClient(
-        book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}
-    )
-    client.execute()
-    first, second = (cell["outputs"] for cell in book["cells"])
-    assert {one["name"] for one in first} <= {"stderr"}  # lines of progress
-    assert "data:image/png;base64" in second[0]["data"]["text/html"]
-    assert second[0]["data"]["text/plain"].startswith("<Result: 60 scans")
