@@ -19,6 +19,7 @@ from stillmap.core.input_files import (
     read_bytes,
     read_text,
 )
+from stillmap.core.json import read_json
 
 LARGE = 1 << 20  # bytes, more than are read at once
 
@@ -99,6 +100,13 @@ def test_file_that_grows(file):
             more.write(b"more")
         assert start + opened.read() == whole
         assert opened.read(1) == b""
+
+
+def test_texts_with_nul(tmp_path):
+    """No path, topic or name can hold it."""
+    (tmp_path / "a.json").write_text('{"path": "a\\u0000b"}')
+    with pytest.raises(InputError, match=r"a\.json: is not JSON: a text holds NUL"):
+        read_json(tmp_path / "a.json", 100)
 
 
 def test_limit_of_size(file):
