@@ -105,16 +105,7 @@ COMMANDS = {
     "config": "every option with its default, unit and meaning, as TOML",
 }
 
-_COMMANDS_EPILOG = """examples:
-  stillmap info log.clf.gz              what is in a recording
-  stillmap map log.clf.gz -o out        map it
-  stillmap merge mon tue -o place       sessions of one place into one map
-  stillmap view out                     look at the map and the report
-  stillmap fleet recordings -o all      map every recording of a folder
-  stillmap filter out -o clean.clf      the recording without dynamic beams
-  stillmap convert log.bag -o log.mcap  one format to another
-  stillmap simulate hall -o sim         a recording with truth
-  stillmap eval labels out sim          score the labels
+_EPILOG = """`stillmap COMMAND --help` shows examples.
 
 exit status:
   0    done
@@ -130,7 +121,7 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
     top = Parser(
         prog="stillmap",
         description="Clean maps of static environments from recordings full of moving objects.",
-        epilog=_COMMANDS_EPILOG,
+        epilog=_EPILOG,
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     top.set_defaults(verbose=False, quiet=False)

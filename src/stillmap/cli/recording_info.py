@@ -34,7 +34,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
         "part": notes.get("part") or {},
-        "beam_times_s": _beam_time_range(recording.beam_time),
+        "beam_times_s": _extremes(recording.beam_time),
         "spin": None if source.spin is None else source.spin.direction,
         "odometry": _summarize_odometry(recording, source.odometry),
         "recorded_poses": _summarize_path(recording.T_recorded_base),
@@ -93,13 +93,11 @@ def _summarize_time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
     }
 
 
-def _beam_time_range(beam_time: NDArray[np.float32] | None) -> list[float] | None:
-    """Earliest and latest beam time of all scans, s after the scan's stamp."""
-    if beam_time is None or not len(beam_time):
+def _extremes(values: NDArray[np.float32] | None) -> list[float] | None:
+    """The least and the greatest of the values."""
+    if values is None or not len(values):
         return None
-    blocks = arrays.iter_blocks(beam_time)
-    first, last = zip(*((beam_time[b].min(), beam_time[b].max()) for b in blocks), strict=True)
-    return [float(min(first)), float(max(last))]
+    return [float(values.min()), float(values.max())]
 
 
 def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
@@ -109,8 +107,7 @@ def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str
     metres, degrees = _step_lengths(T)
     return {
         **{key: noted[key] for key in ("from", "outside") if noted.get(key) is not None},
-        "path_length_m": float(metres.sum()),
-        "turned_deg": float(degrees.sum()),
+        **(_summarize_path(T) or {}),
         "largest_step_m": float(metres.max(initial=0.0)),
         "largest_step_deg": float(degrees.max(initial=0.0)),
         "largest_step_at_ns": int(recording.stamp_ns[metres.argmax()]) if len(metres) else None,
@@ -197,11 +194,11 @@ def _field_of_view(
         last = first + (n - 1) * step
         lowest, highest = sorted([first, last])  # a laser upside down turns clockwise
         return [float(np.degrees(lowest)), float(np.degrees(highest))]
-    lowest, highest = np.inf, -np.inf
+    angles = np.array([np.inf, -np.inf])
     for scan in recording.iter_scans(scans.tolist()):
         points = recording.points[recording.beams_of(scan)]
         angle = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
         angle = angle[np.isfinite(angle)]
-        lowest = min(lowest, float(angle.min(initial=np.inf)))
-        highest = max(highest, float(angle.max(initial=-np.inf)))
-    return [lowest, highest] if lowest <= highest else None
+        angles[0] = angle.min(initial=angles[0])
+        angles[1] = angle.max(initial=angles[1])
+    return angles.tolist() if angles[0] <= angles[1] else None
