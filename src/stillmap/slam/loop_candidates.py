@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.sparse import csgraph, csr_array
+import scipy  # its parts load when they are first used
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float
@@ -82,8 +82,8 @@ def _shortest_paths(
     order = np.argsort(weights)  # of edges between the same keyframes the shortest counts
     ends, shortest = np.unique(np.sort(ends, axis=0)[:, order], axis=1, return_index=True)
     row, column = ends
-    graph = csr_array((weights[order][shortest], (row, column)), shape=(k + 1, k + 1))
-    return np.asarray(csgraph.dijkstra(graph, directed=False, indices=[k])[0])
+    graph = scipy.sparse.csr_array((weights[order][shortest], (row, column)), shape=(k + 1, k + 1))
+    return np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=[k])[0])
 
 
 def blind_stds(context: LoopContext, k: int, closures: list[LoopClosure]) -> tuple[Float, Float]:
