@@ -1,4 +1,4 @@
-"""Synthetic recordings: one scan a second of a wall, with objects in front of it."""
+"""Synthetic recordings: walls, with objects and walkers in front of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -134,3 +134,46 @@ def watch(
         what_hit >= 0,
     )
     return Watched(recording, what_hit)
+
+
+ANGLES = np.radians(np.arange(-90.0, 91.0))
+WALL = 6.0  # metres ahead
+
+
+def recording_of(ranges: Any, seconds: Any = None) -> Recording:
+    """Scans of 181 beams from the origin; inf: nothing came back, nan: unusable."""
+    ranges = np.atleast_2d(np.asarray(ranges, float))
+    T, N = ranges.shape
+    seconds = 0.2 * np.arange(T) if seconds is None else np.asarray(seconds)
+    points = np.where(np.isinf(ranges), 20.0, ranges)[..., None] * fan()
+    return of_one_sensor(
+        np.round(1e9 * seconds).astype(np.int64),
+        N * np.arange(T + 1),
+        points.reshape(-1, 2).astype(np.float32),
+        np.isfinite(ranges).ravel(),
+    )
+
+
+def at_origin(recording: Recording) -> Any:
+    return np.tile(np.eye(3), (recording.n_scans, 1, 1))
+
+
+def wall() -> Any:
+    """(181,) metres to a wall across the way ahead, 10 m where it is farther than that."""
+    return np.minimum(Wall((1, 0), WALL).ranges(np.zeros(2), fan()), 10.0)
+
+
+def before(ranges: Any, *balls: tuple[float, float, float]) -> Any:
+    """The same with round things, each x, y and radius, standing before."""
+    of_balls = [Ball(x, y, 0, 0, r).ranges(np.zeros(2), fan()) for x, y, r in balls]
+    return np.fmin.reduce([ranges, *of_balls])
+
+
+def crossing(times: Any, speed=1.2, x=3.0, start=-2.0, *, pillar: Any = None) -> tuple[Any, Any]:
+    """Ranges (T, 181) of somebody on two legs who walks across, and which beams he is hit by."""
+    behind = before(wall(), *([pillar] if pillar else []))
+    scans = []
+    for t in times:
+        y, swing = start + speed * t, 0.15 * np.sin(2 * np.pi * t)
+        scans.append(before(behind, (x - 0.1, y + swing, 0.07), (x + 0.1, y - swing, 0.07)))
+    return np.array(scans), np.array(scans) < behind

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up_scans import ANGLES
+from made_up import ANGLES
 from recordings import of_one_sensor
 
 from stillmap import _core, em
+from stillmap.core import se2
 
 POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
 SCANS, SECONDS = 80, 0.5
@@ -26,8 +27,7 @@ def seen(at, hit_mask):
     depth = RADIUS**2 - ((off**2).sum(axis=1)[:, None] - along**2)
     on = (depth > 0) & (along > 0) & np.asarray(hit_mask)[:, None]
     ranges = np.where(on, along - np.sqrt(np.maximum(depth, 0)), ranges)
-    T = np.tile(np.eye(3), (len(at), 1, 1))
-    T[:, 0, 2] = at
+    T = se2.matrix(at, 0.0, 0.0)
     points = ranges[..., None] * directions
     recording = of_one_sensor(
         np.round(1e9 * SECONDS * np.arange(len(at))).astype(np.int64),
@@ -66,16 +66,15 @@ def test_view_dependent_surface_is_static(turn):
     assert np.quantile(last[wall], 0.05) > 0.9
 
 
-@pytest.mark.parametrize("at", [np.full(SCANS, 2.0), ROUNDS], ids=["stands", "moves"])
-def test_passers_by_are_dynamic(at):
-    hit_mask = (np.arange(SCANS) >= 30) & (np.arange(SCANS) < 34)
-    _, last, on = labels(at, hit_mask)
-    assert np.median(last[on]) < 0.1
+STANDS = np.full(SCANS, 2.0)
+PASSES = (np.arange(SCANS) >= 30) & (np.arange(SCANS) < 34)
+ALTERNATES = np.random.default_rng(1).random(SCANS) < 0.5
 
 
-def test_alternation_before_a_standing_sensor_is_dynamic():
-    at = np.full(SCANS, 2.0)
-    hit_mask = np.random.default_rng(1).random(SCANS) < 0.5
+@pytest.mark.parametrize(
+    ("at", "hit_mask"), [(STANDS, PASSES), (ROUNDS, PASSES), (STANDS, ALTERNATES)]
+)
+def test_passers_by_and_what_alternates_before_a_standing_sensor_are_dynamic(at, hit_mask):
     loop, last, on = labels(at, hit_mask)
     assert np.median(loop[on]) < 0.1
     assert np.median(last[on]) < 0.1
@@ -91,15 +90,12 @@ def test_two_lasers_do_not_turn_the_view():
     at = np.full(3 * len(COMES_AND_GOES), 2.0)
     second = np.arange(len(at)) % 2 == 1
     recording, _, on = seen(at + APART * second, np.repeat(COMES_AND_GOES, 3))
-    T_base_sensor = np.tile(np.eye(3), (2, 1, 1))
-    T_base_sensor[1, 0, 2] = APART
     recording = replace(
         recording,
-        T_base_sensor=T_base_sensor,
+        T_base_sensor=se2.matrix([0.0, APART], 0.0, 0.0),
         sensor=second.astype(np.int32),
         stamp_ns=recording.stamp_ns // 3,
     )
-    T = np.tile(np.eye(3), (len(at), 1, 1))
-    T[:, 0, 2] = at
+    T = se2.matrix(at, 0.0, 0.0)
     last, _ = em.final_e_step(recording, T, 0.05, em.EmOptions())
     assert np.median(last.p_static[on]) < 0.1

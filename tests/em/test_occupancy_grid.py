@@ -54,35 +54,36 @@ def at(m, points):
 Y = np.arange(-2.0, 2.0, RESOLUTION) + RESOLUTION / 2  # of cells along a wall
 
 
+def mapped(seen):
+    """The E-step, and its map."""
+    found = seen.e_step(RESOLUTION)
+    return found, em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+
+
 def a_room_with(wall):
     """A wall at this x, people walking by and one who stood for a while: what became of it."""
     walls = [Wall((1, 0), wall), Wall((0, 1), 3.04), Wall((0, -1), 3.04)]
     movers = [Ball(2.0, -1.4 + 0.4 * k, 20 + k, 21 + k) for k in range(8)]
     seen = watch([*walls, *movers, Ball(2.5, 1.5, 5, 20)], 60, noise=0.015)
-    found = seen.e_step(RESOLUTION)
-    m = em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
-    return seen, seen.what >= len(walls), m
+    return seen, seen.what >= len(walls), mapped(seen)[1]
 
 
 def column(m, x):
     return at(m, np.column_stack([Y * 0 + x, Y]))
 
 
-@pytest.mark.parametrize("inside", [0.35, 0.5, 0.65])
-def test_walls_are_crisp(inside):
+@pytest.mark.parametrize(
+    ("inside", "filled"),
+    [*((x, [0]) for x in (0.35, 0.5, 0.65)), *((x, [-1, 0]) for x in (0.0, 0.05)), (0.95, [0, 1])],
+)
+def test_walls_are_crisp(inside, filled):
+    """On the border of two cells a wall belongs to both; noise filled the cells beside it too."""
     *_, m = a_room_with(4.0 + inside * RESOLUTION)
-    assert (column(m, 4.05) > 0.8).mean() > 0.95
-    assert not (column(m, 3.95) > 0.35).any()  # noise filled these cells too
-    assert not (column(m, 4.15) > 0.35).any()  # NaN counts as neither
-
-
-@pytest.mark.parametrize(("inside", "other"), [(0.0, -1), (0.05, -1), (0.95, 1), (1.0, 1)])
-def test_a_wall_on_the_border_of_two_cells_belongs_to_both(inside, other):
-    *_, m = a_room_with(4.0 + inside * RESOLUTION)
-    assert (column(m, 4.05) > 0.6).mean() > 0.95
-    assert (column(m, 4.05 + other * RESOLUTION) > 0.6).mean() > 0.95
-    for beyond in (-other, 2 * other):
-        assert not (column(m, 4.05 + beyond * RESOLUTION) > 0.35).any()
+    for k in filled:
+        least = 0.8 if len(filled) == 1 else 0.6
+        assert (column(m, 4.05 + k * RESOLUTION) > least).mean() > 0.95
+    for k in (filled[0] - 1, filled[-1] + 1):
+        assert not (column(m, 4.05 + k * RESOLUTION) > 0.35).any()  # NaN counts as neither
 
 
 def around(m, x, y, cells=2):
@@ -95,8 +96,7 @@ def around(m, x, y, cells=2):
 def test_range_noise_fills_no_cells(y):
     post = Ball(2.08, y, 0, 60, radius=0.03)
     seen = watch([Wall((1, 0), 4.05), post], 60, fan(721, 90), noise=0.025)
-    found = seen.e_step(RESOLUTION)
-    m = em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    found, m = mapped(seen)
     near = around(m, 2.05, y)
     hits = around(em.make_occupancy_map(seen.grid(None, RESOLUTION)), 2.05, y) > 0
     assert hits.sum() >= 3
@@ -112,10 +112,9 @@ def test_range_noise_fills_no_cells(y):
 def test_thin_posts_stay(x, y, radius):
     # in the middle of a cell or on its border, before a wall that gets many more beams
     post = Ball(x + radius, y, 0, 60, radius)
-    seen = watch([Wall((1, 0), x + 0.4), post, *[Ball(1.0, k, k, k + 1) for k in (-1, 1)]], 60,
-                 fan(721, 90), noise=0.01)  # fmt: skip
-    found = seen.e_step(RESOLUTION)
-    m = em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    passing = [Ball(1.0, k, k, k + 1) for k in (-1, 1)]
+    seen = watch([Wall((1, 0), x + 0.4), post, *passing], 60, fan(721, 90), noise=0.01)
+    _, m = mapped(seen)
     there = np.unique(np.floor(seen.of(seen.recording.points, 1) / RESOLUTION), axis=0)
     assert (at(m, (there + 0.5) * RESOLUTION) > 0.8).any()
     ends = at(m, seen.of(seen.recording.points, 1))
@@ -184,17 +183,13 @@ def test_a_far_room_is_left_out():
     alone = em.make_occupancy_map(rooms((0, 0))[0])
     grid, places = rooms((0, 0), (0, 0), (3e4, -2e4))
     m = em.make_occupancy_map(grid, places=places)
+    around = em.make_occupancy_map(grid, places=places[-1:])
+    assert np.abs(np.array(around.origin[:2]) - [3e4, -2e4]).max() < 5.0
     assert np.abs(np.subtract(m.origin, alone.origin)).max() < 1.6  # a block
     assert (~np.isnan(m.p_occupied)).sum() == (~np.isnan(alone.p_occupied)).sum()
     beyond = em.find_hits_beyond(grid, m.window)
     assert np.abs(beyond - [3e4, -2e4]).max() < 5.0
     assert not len(em.find_hits_beyond(rooms((0, 0))[0], alone.window))
-
-
-def test_the_map_lies_around_the_places():
-    grid, _ = rooms((0, 0), (3e4, -2e4))
-    m = em.make_occupancy_map(grid, places=np.array([[3e4, -2e4]]))
-    assert np.abs(np.array(m.origin[:2]) - [3e4, -2e4]).max() < 5.0
 
 
 def test_rooms_of_one_building_stay_together():

@@ -7,7 +7,7 @@ import pytest
 from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
 from rooms import ROOM, ROUTE, drive
 
-from stillmap import _core, em
+from stillmap import em
 from stillmap.core import chunks
 from stillmap.em import occupancy_hmm
 from stillmap.results.eval.labels import assign_equal_width_bins, compute_calibration_error
@@ -32,30 +32,22 @@ def known(busy):
     return busy.e_step()
 
 
-def test_walls_are_static(busy, known):
-    e = busy.of(known.p_static, 0, 1, 2)
-    assert np.median(e) > 0.99
-    assert np.quantile(e, 0.02) > 0.9
-
-
-def test_walkers_are_dynamic(busy, known):
-    e = busy.of(known.p_static, *range(BALL, BALL + 4))
-    assert len(e) > 30
-    assert e.max() < 0.1
-
-
-def test_standing_then_leaving_is_dynamic(busy, known):
-    e = busy.of(known.p_static, BALL + 4)
-    assert len(e) > 100
-    assert np.median(e) < 0.05
-    assert np.quantile(e, 0.95) < 0.3
-
-
-@pytest.mark.parametrize(("since", "until"), [(0, 25), (65, 90)])
-def test_present_at_the_start_or_the_end_is_dynamic(since, until):
-    seen = watch([*WALLS, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
-    e = seen.of(seen.e_step().p_static, BALL + 4)
-    assert np.median(e) < 0.2
+def test_walls_are_static_and_who_walks_or_stands_for_a_while_is_dynamic(busy, known):
+    walls = busy.of(known.p_static, 0, 1, 2)
+    assert np.median(walls) > 0.99
+    assert np.quantile(walls, 0.02) > 0.9
+    walker, stands = (
+        busy.of(known.p_static, *range(BALL, BALL + 4)),
+        busy.of(known.p_static, BALL + 4),
+    )
+    assert len(walker) > 30
+    assert walker.max() < 0.1
+    assert len(stands) > 100
+    assert np.median(stands) < 0.05
+    assert np.quantile(stands, 0.95) < 0.3
+    for since, until in ((0, 25), (65, 90)):  # at the start, at the end
+        seen = watch([*WALLS, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
+        assert np.median(seen.of(seen.e_step().p_static, BALL + 4)) < 0.2
 
 
 def test_fitted_parameters(busy, known):
@@ -138,16 +130,12 @@ def test_a_time_bin_may_span_scans(busy, known):
     assert found.likelihood == known.likelihood
 
 
-@pytest.mark.parametrize("beams", [1, 5000])
-def test_chunks_and_threads_change_no_bit(busy, known, monkeypatch, beams):
+@pytest.mark.parametrize(("beams", "threads"), [(1, 1), (5000, 3)])
+def test_chunks_and_threads_change_no_bit(busy, known, monkeypatch, beams, threads):
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
-    for threads in (1, 3):
-        options = em.EmOptions()
-        grid = _core.OccupancyGrid2D(0.1)
-        found = em.e_step(busy.recording, busy.poses, grid, "stillmap", options, threads)
-        assert found.p_static.tobytes() == known.p_static.tobytes()
-        assert found.likelihood == known.likelihood
-        assert found.learned == known.learned
+    found = occupancy_hmm.e_step(busy.recording, busy.poses, 0.1, em.EmOptions(), threads)
+    assert found.p_static.tobytes() == known.p_static.tobytes()
+    assert (found.likelihood, found.learned) == (known.likelihood, known.learned)
 
 
 def test_invariant_to_stamp_and_map_origin(busy, known):
@@ -170,16 +158,6 @@ def test_the_bound_prefers_true_poses(busy, known):
     assert found.likelihood.bound < known.likelihood.bound
 
 
-def test_3d():
-    wall, ball = Wall((1, 0, 0), 4.1), Ball(2.0, 0.3, 15, 25, radius=0.5)
-    seen = watch([wall, ball], 40, cone())
-    found = seen.e_step(resolution=0.3)
-    assert np.quantile(seen.of(found.p_static, 0), 0.02) > 0.9
-    assert len(seen.of(found.p_static, 1)) > 200
-    assert np.quantile(seen.of(found.p_static, 1), 0.9) < 0.2
-    assert found.occupied.cells.shape[1] == 3
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_without_hits_labels_are_the_prior(dimension):
     seen = watch([], 10, fan() if dimension == 2 else cone(5))
@@ -187,14 +165,10 @@ def test_without_hits_labels_are_the_prior(dimension):
     np.testing.assert_array_equal(found.p_static, np.float32(0.8))
     assert np.isfinite([found.likelihood.bound, found.likelihood.expected]).all()
     assert len(found.occupied.cells) == 0
-
-
-def test_one_hit():
-    seen = watch([Ball(2.0, 0.0, 0, 9, radius=0.01)], 1, fan(3, 40))
-    assert seen.recording.hit.sum() == 1
-    found = seen.e_step(prior=0.7)
-    # everything is as likely as before: not seen again
-    assert found.p_static[1] == pytest.approx(0.7, abs=1e-6)
+    # of what is hit once everything is as likely as before
+    once = watch([Ball(2.0, 0.0, 0, 9, radius=0.01)], 1, fan(3, 40))
+    assert once.recording.hit.sum() == 1
+    assert once.e_step(prior=0.7).p_static[1] == pytest.approx(0.7, abs=1e-6)
 
 
 @pytest.fixture(scope="module")

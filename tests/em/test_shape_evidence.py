@@ -1,13 +1,19 @@
-"""Shapes tell people from walls where the history of a place does not."""
+"""Shapes tell people from walls where the history of a place does not; segments of scans."""
+
+import functools
 
 import numpy as np
 import pytest
 
 from stillmap import em
+from stillmap.core.chunks import ScanBeams
 from stillmap.em.shape_evidence import (
+    _BOTH_FARTHER,
     _MAX_LOG_RATIO,
+    _UNKNOWN,
     N_SEGMENT_TYPES,
     _fit_shapes,
+    classify_segments,
     count_segments,
 )
 from stillmap.sim import scene_by_name, simulate
@@ -15,16 +21,17 @@ from stillmap.sim import scene_by_name, simulate
 RESOLUTION = 0.05
 
 
-@pytest.fixture(scope="module")
+@functools.cache
+def corridor(name, scans):
+    return simulate(scene_by_name(name, {"robot": {"scans": scans}}), 3)
+
+
+@pytest.fixture
 def crowd():
-    return simulate(scene_by_name("corridor-crowd", {"robot": {"scans": 250}}), 3)
+    return corridor("corridor-crowd", 250)
 
 
-@pytest.fixture(scope="module")
-def empty():
-    return simulate(scene_by_name("corridor-empty", {"robot": {"scans": 150}}), 3)
-
-
+@functools.cache
 def label(simulation, threads=1, *, with_shapes=True):
     recording, poses, options = simulation.recording, simulation.truth.T_world_base, em.EmOptions()
     found, _ = em.final_e_step(
@@ -33,12 +40,12 @@ def label(simulation, threads=1, *, with_shapes=True):
     return found.p_static
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def found(crowd):
     return label(crowd)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def by_history(crowd):
     return label(crowd, with_shapes=False)
 
@@ -71,7 +78,8 @@ def test_people_seen_for_a_moment_are_no_obstacles(crowd, found, by_history):
     assert np.mean(found[people] >= 0.5) < 0.6 * np.mean(by_history[people] >= 0.5)
 
 
-def test_where_nobody_is_nothing_changes(empty):
+def test_where_nobody_is_nothing_changes():
+    empty = corridor("corridor-empty", 150)
     hit = empty.recording.hit
     last, without = label(empty)[hit], label(empty, with_shapes=False)[hit]
     assert np.mean(last < 0.5) <= np.mean(without < 0.5) + 1e-3
@@ -121,6 +129,8 @@ def test_without_a_history_that_tells_shapes_say_nothing():
     _, history, _, segments = made_up()
     history[:] = 0.7, 0.3
     np.testing.assert_allclose(fit(history, segments), 0.0, atol=1e-9)
+    _, history, _, segments = made_up(6)  # nor do few surfels say much
+    assert np.abs(fit(history, segments)).max() < 0.3
 
 
 def test_shapes_never_decide_alone():
@@ -133,11 +143,6 @@ def test_shapes_never_decide_alone():
     assert (log_ratio > 0.0).tolist() == (~static).tolist()
 
 
-def test_few_surfels_say_little():
-    _, history, _, segments = made_up(6)
-    assert np.abs(fit(history, segments)).max() < 0.3
-
-
 def test_view_dependent_things_have_frequencies_of_their_own():
     """A post is as narrow as a leg; its history says that it is static, seen from some sides."""
     static, history, is_narrow, segments = made_up()
@@ -146,3 +151,47 @@ def test_view_dependent_things_have_frequencies_of_their_own():
     log_ratio = _fit_shapes(p, segments, np.zeros(len(p), np.intp))
     assert (log_ratio[is_narrow, 1] > 1.0).all()
     assert (np.abs(log_ratio[is_narrow, 2] - log_ratio[is_narrow, 1]) < 0.4).all()
+
+
+STEP = np.radians(0.5)
+NO_RETURN, UNUSABLE = 0.0, -1.0
+
+
+def scans(*ranges):
+    """Scans of beams half a degree apart; NO_RETURN: at 30 m without a return."""
+    points, hit = [], []
+    for some in ranges:
+        some = np.asarray(some, float)
+        angle = STEP * np.arange(len(some))
+        reach = np.where(some == NO_RETURN, 30.0, np.where(some == UNUSABLE, np.nan, some))
+        points.append(reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
+        hit.append(some > 0.0)
+    n = [len(some) for some in ranges]
+    T = np.tile(np.eye(3), (len(n), 1, 1))
+    ends = np.concatenate(points).astype(np.float32)
+    return ScanBeams(ends, np.concatenate(hit), np.append(0, np.cumsum(n)), T)
+
+
+def test_a_leg_before_a_wall():
+    # 0.105 m wide; the wall goes on behind it, and beyond both ends of the scan
+    found = classify_segments(scans([6.0] * 40 + [4.0] * 4 + [6.0] * 40))
+    width, order = np.divmod(found, 4)
+    assert (found >= 0).all()
+    assert (found < N_SEGMENT_TYPES).all()
+    assert set(order[40:44]) == {_BOTH_FARTHER}
+    assert set(width[40:44]) == {0}
+    assert set(order[:40]) == set(order[44:]) == {_UNKNOWN}
+    assert set(width[:40]) == {5}  # 2 m
+
+
+def test_scans_do_not_touch():
+    row = [5.0] * 30
+    alone = classify_segments(scans(row))
+    for both in (scans(row, row), scans(row, [], row)):
+        np.testing.assert_array_equal(classify_segments(both), np.tile(alone, 2))
+
+
+def test_nothing_to_classify():
+    assert classify_segments(scans([])).shape == (0,)
+    assert (classify_segments(scans([NO_RETURN] * 9)) == -1).all()
+    assert (classify_segments(scans([UNUSABLE] * 9)) == -1).all()
