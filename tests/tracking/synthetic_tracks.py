@@ -40,19 +40,15 @@ def watched(ways, visible=None, seconds=8.0, points=5, radius=0.12, seed=0):
         scan += [s] * len(order)
         xy.append(all_xy[order])
         who.append(mine[order])
-    scan, xy, who = np.array(scan), np.concatenate(xy), np.concatenate(who)
-    distance = np.linalg.norm(xy, axis=1)
-    made = DynamicPoints(
-        t,
-        scan,
-        np.arange(len(scan)),
-        xy,
-        distance,
-        np.zeros((len(t), 2)),
-        _cluster(scan, xy, distance),
-        np.searchsorted(scan, np.arange(len(t) + 1)),
-    )
-    return made, who
+    made = points_of(t, np.array(scan), np.concatenate(xy), np.zeros((len(t), 2)))
+    return made, np.concatenate(who)
+
+
+def points_of(seconds, scan, xy, sensor):
+    """Dynamic points seen from these positions (T, 2)."""
+    distance = np.linalg.norm(xy - sensor[scan], axis=1)
+    cluster, first = _cluster(scan, xy, distance), np.searchsorted(scan, np.arange(len(sensor) + 1))
+    return DynamicPoints(seconds, scan, np.arange(len(scan)), xy, distance, sensor, cluster, first)
 
 
 def one_each(owner, who):

@@ -21,36 +21,32 @@ def straight(x, y, vx, vy):
     return lambda t: (x + vx * t, y + vy * t)
 
 
-def test_one_thing_that_walks():
-    points, who = watched([straight(2, 1, 1.2, 0.1)])
-    assert one_each(assign_tracks(points, MAX_GAP), who)
-    assert one_each(found(points), who)
+ALONE, BESIDE = straight(2, 1, 1.2, 0.1), straight(2, 1, 1.0, 0.3)
+CROSSING = [straight(3, -4, 0.0, 1.1), straight(7.0, 0.4, -1.1, 0.0)]  # 0.4 m past one another
 
 
-@pytest.mark.parametrize("apart", [0.8, 1.5])
-def test_two_that_walk_beside_one_another(apart):
-    points, who = watched([straight(2, 1, 1.0, 0.3), straight(2, 1 + apart, 1.0, 0.3)])
-    assert one_each(found(points), who)
-
-
+@pytest.mark.parametrize(
+    "ways",
+    [
+        [ALONE],
+        [BESIDE, straight(2, 1.8, 1.0, 0.3)],
+        [BESIDE, straight(2, 2.5, 1.0, 0.3)],
+        CROSSING,
+    ],
+    ids=["alone", "beside", "apart", "crossing"],
+)
 @pytest.mark.parametrize("seed", range(4))
-def test_two_that_cross(seed):
-    # 0.4 m past one another
-    ways = [straight(3, -4, 0.0, 1.1), straight(7.0, 0.4, -1.1, 0.0)]
+def test_each_has_a_track(ways, seed):
     points, who = watched(ways, seed=seed)
     assert one_each(found(points), who)
 
 
-def test_one_that_is_hidden_for_a_while():
-    way = straight(3, -4, 0.1, 1.0)
-    for hidden in (0.6, 1.4, 2.4):
-        points, who = watched([way], lambda _, t, hidden=hidden: not 3.0 < t < 3.0 + hidden)
-        assert one_each(found(points), who)
-
-
-def test_one_that_is_hidden_for_long_is_another():
-    points, _ = watched([straight(3, -4, 0.1, 1.0)], lambda _, t: not 1.4 < t < 6.2)
-    assert len(np.unique(found(points))) == 2
+@pytest.mark.parametrize(
+    ("first", "last", "tracks"), [(3.0, 3.6, 1), (3.0, 4.4, 1), (3.0, 5.4, 1), (1.4, 6.2, 2)]
+)
+def test_one_that_is_hidden_for_a_while_is_the_same(first, last, tracks):
+    points, _ = watched([straight(3, -4, 0.1, 1.0)], lambda _, t: not first < t < last)
+    assert len(np.unique(found(points))) == tracks
 
 
 def test_who_comes_out_from_behind_one_that_stands():
@@ -77,15 +73,12 @@ def test_legs_are_one_thing():
         return (t * 2.3 + 0.5 * i) % 1.0 < 0.75
 
     points, _ = watched([leg(1.0), leg(-1.0)], visible, points=2, radius=0.06)
-    owner = found(points)
-    assert len(np.unique(owner)) == 1
+    assert len(np.unique(found(points))) == 1
 
 
 def test_a_long_thing_is_one():
-    def part(dx):
-        return straight(-8 + dx, 6, 2.5, 0.0)
-
-    points, _ = watched([part(dx) for dx in np.arange(0.0, 4.0, 0.5)], points=4, radius=0.2)
+    parts = [straight(x, 6, 2.5, 0.0) for x in np.arange(-8.0, -4.0, 0.5)]
+    points, _ = watched(parts, points=4, radius=0.2)
     assert len(np.unique(found(points))) == 1
 
 
@@ -118,11 +111,8 @@ def test_turned_and_moved_worlds_give_the_same():
 @pytest.mark.parametrize("angle", [0.5, 0.7, 1.0])
 def test_tracks_that_were_exchanged_behind_one_another_are_set_right(angle):
     vx, vy = 1.2 * np.cos(angle), 1.2 * np.sin(angle)
-    ways = [
-        straight(6.0 - 4.0 * vx, -4.0 * vy, vx, vy),
-        straight(6.1 - 4.0 * vx, 4.0 * vy, vx, -vy),
-    ]
-    points, who = watched(ways)
+    one, other = (straight(x - 4.0 * vx, -4.0 * v, vx, v) for x, v in ((6.0, vy), (6.1, -vy)))
+    points, who = watched([one, other])
     exchanged = np.where(points.seconds[points.scan] < 4.0, who, 1 - who)
     assert not one_each(exchanged, who)
     owner, p_identity = stitch_tracklets(points, exchanged)

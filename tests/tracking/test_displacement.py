@@ -1,4 +1,7 @@
-"""Which tracks in 3D are listed: those that travel, and what is seen to come or leave."""
+"""Which tracks in 3D are listed: those that travel, and what is seen to come or leave.
+
+Parts of static surfaces are not.
+"""
 
 import dataclasses
 
@@ -7,16 +10,22 @@ import pytest
 
 from stillmap import Recording
 from stillmap.tracking import MovingObject
-from stillmap.tracking.displacement import select_movers
+from stillmap.tracking.displacement import count_neighbors, drop_surface_parts, select_movers
 
 SCANS, PERIOD, HEIGHT = 60, 0.1, 1.5
 AT = np.array([4.0, 0.0])
 
 
+def directions(azimuth, elevation):
+    """(N, 3) one metre along x."""
+    a, e = azimuth.ravel(), elevation.ravel()
+    return np.column_stack([np.ones(a.size), np.tan(a), np.tan(e) / np.cos(a)])
+
+
 def sweep(there, width=0.5):
     """A wall 8 m ahead, before which a thing stands or does not."""
-    a, e = np.meshgrid(np.radians(np.arange(-20, 20.1, 0.5)), np.radians(np.arange(-15, 8, 1.0)))
-    d = np.column_stack([np.ones(a.size), np.tan(a.ravel()), np.tan(e.ravel()) / np.cos(a.ravel())])
+    beams = np.radians(np.arange(-20, 20.1, 0.5)), np.radians(np.arange(-15, 8, 1.0))
+    d = directions(*np.meshgrid(*beams))
     on = there & (np.abs(d[:, 1] * AT[0] - AT[1]) < 0.5 * width)
     return (np.where(on, AT[0], 8.0)[:, None] * d).astype(np.float32)
 
@@ -32,17 +41,9 @@ def street(there, **thing):
 def an_object(recording, first, last, travel=0.0, number=3):
     scan = np.arange(first, last)
     xy = AT + np.column_stack([np.zeros(len(scan)), np.linspace(0, travel, len(scan))])
-    return MovingObject(
-        number,
-        scan,
-        recording.stamp_ns[scan],
-        xy,
-        np.zeros_like(xy),
-        (0.5, 0.5, 0.8),
-        np.arange(5),
-        1.0,
-        np.full(len(scan), HEIGHT),
-    )
+    still, z = np.zeros_like(xy), np.full(len(scan), HEIGHT)
+    of_scans = scan, recording.stamp_ns[scan], xy, still
+    return MovingObject(number, *of_scans, (0.5, 0.5, 0.8), np.arange(5), 1.0, z)
 
 
 def scans(*ranges):
@@ -53,26 +54,21 @@ def scans(*ranges):
 
 
 @pytest.mark.parametrize(
-    ("there", "listed"),
+    ("there", "width", "listed"),
     [
-        (scans((0, SCANS)), False),  # it is there all the time
-        (scans((20, 40)), True),
-        (scans((0, 40)), True),  # left
-        (scans((20, SCANS)), True),  # came
-        (scans((0, 21), (22, SCANS)), False),
+        (scans((0, SCANS)), 0.5, False),  # it is there all the time
+        (scans((0, SCANS)), 0.04, False),  # beams pass beside a thin post
+        (scans((0, SCANS)), 0.1, False),
+        (scans((20, 40)), 0.5, True),  # for a while
+        (scans((0, 40)), 0.5, True),  # left
+        (scans((20, SCANS)), 0.5, True),  # came
+        (scans((0, 21), (22, SCANS)), 0.5, False),  # missed once
     ],
-    ids=["always", "for a while", "left", "came", "missed once"],
 )
-def test_standing(there, listed):
-    recording, poses = street(there)
+def test_standing(there, width, listed):
+    recording, poses = street(there, width=width)
     found = select_movers([an_object(recording, 20, 40)], recording, poses)
     assert len(found) == listed
-
-
-@pytest.mark.parametrize("width", [0.04, 0.1])
-def test_beams_beside_a_thin_post_do_not_empty_its_place(width):
-    recording, poses = street(scans((0, SCANS)), width=width)
-    assert select_movers([an_object(recording, 20, 40)], recording, poses) == []
 
 
 @pytest.mark.parametrize(("share", "listed"), [(0.2, False), (1.0, True)], ids=["bush", "person"])
@@ -92,22 +88,78 @@ def test_few_beams_empty_the_place_of_what_stops_all(share, listed):
     assert len(select_movers([an_object(recording, 20, 40)], recording, poses)) == listed
 
 
-@pytest.mark.parametrize(("travel", "listed"), [(0.4, False), (0.6, True)])
-def test_travel(travel, listed):
+def test_those_that_travel_have_ids_from_0():
     recording, poses = street(scans((0, SCANS)))
-    found = select_movers([an_object(recording, 20, 40, travel)], recording, poses)
-    assert len(found) == listed
-
-
-def test_without_other_looks_nothing_shows_that_it_moved():
-    recording, poses = street(scans((0, SCANS)))
-    assert select_movers([an_object(recording, 0, SCANS)], recording, poses) == []
-
-
-def test_ids_are_counted_anew():
-    recording, poses = street(scans((0, SCANS)))
-    objects = [an_object(recording, 20, 40, travel, k) for k, travel in enumerate((1.0, 0.0, 2.0))]
+    ways = enumerate((0.6, 0.4, 2.0))
+    objects = [an_object(recording, 20, 40, travel, k) for k, travel in ways]
     found = select_movers(objects, recording, poses)
     assert [one.id for one in found] == [0, 1]
-    assert [np.ptp(one.xy[:, 1]) for one in found] == [1.0, 2.0]
+    assert [np.ptp(one.xy[:, 1]) for one in found] == [0.6, 2.0]
+    # without other scans nothing shows that it moved
+    assert select_movers([an_object(recording, 0, SCANS)], recording, poses) == []
     assert select_movers([], recording, poses) == []
+
+
+SWEEPS = 6
+ACROSS, UP = np.meshgrid(np.radians(np.arange(-20, 20.1, 1.0)), np.radians(np.arange(-9, 10, 2.0)))
+DIRECTIONS = directions(ACROSS, UP)
+
+
+def room(distance):
+    """Sweeps of what lies at a depth in m, one for each direction, and P(static) = 1."""
+    cloud = (np.asarray(distance)[:, None] * DIRECTIONS).astype(np.float32)
+    recording = Recording.from_clouds(0.1 * np.arange(SWEEPS), [cloud] * SWEEPS)
+    return recording, np.ones(recording.n_beams, np.float32)
+
+
+def part_of(recording, own):
+    """One of which the beams `own` of each sweep are."""
+    beams = np.concatenate([t * len(own) + np.flatnonzero(own) for t in range(SWEEPS)])
+    return dataclasses.replace(an_object(recording, 0, SWEEPS), beams=beams)
+
+
+def degrees(low, high):
+    return (np.degrees(ACROSS.ravel()) > low) & (np.degrees(ACROSS.ravel()) < high)
+
+
+PATCH = degrees(-3, 3) & (np.abs(np.degrees(UP.ravel())) < 6)
+
+
+def labelled(p_static, *dynamic):
+    p = p_static.reshape(SWEEPS, -1)
+    for own in dynamic:
+        p[:, own] = 0.0
+    return p.reshape(-1)
+
+
+@pytest.mark.parametrize(("depth", "kept"), [(1.0, True), (4.5, True), (5.0, False)])
+def test_an_object_before_a_wall_is_kept_and_a_patch_of_it_is_none(depth, kept):
+    recording, p = room(np.where(PATCH, depth, 5.0))
+    one = part_of(recording, PATCH)
+    assert drop_surface_parts([one], recording, labelled(p, PATCH)) == [one] * kept
+
+
+def test_surface_on_one_side_does_not_count_enough():
+    recording, p = room(np.where(PATCH | degrees(2, 8), 3.0, 6.0))
+    one = part_of(recording, PATCH)
+    on_it, behind = count_neighbors([one], recording, labelled(p, PATCH))[0]
+    assert 0 < on_it < behind
+    assert drop_surface_parts([one], recording, labelled(p, PATCH)) == [one]
+
+
+def test_neighbors_that_move_do_not_count():
+    """People side by side."""
+    recording, p = room(np.where(degrees(-20, 20), 3.0, 6.0))
+    one = part_of(recording, PATCH)
+    p = labelled(p, PATCH, ~PATCH)
+    assert count_neighbors([one], recording, p).tolist() == [[0, 0]]
+    assert drop_surface_parts([one], recording, p) == [one]
+
+
+def test_a_single_beam_and_no_object():
+    recording, p = room(np.full(len(DIRECTIONS), 5.0))
+    own = np.arange(len(DIRECTIONS)) == len(DIRECTIONS) // 2
+    on_it, behind = count_neighbors([part_of(recording, own)], recording, p)[0]
+    assert on_it > 0
+    assert behind == 0
+    assert drop_surface_parts([], recording, p) == []

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from synthetic_tracks import watched
+from synthetic_tracks import points_of, watched
 
 from stillmap.tracking import fast_movers
 from stillmap.tracking.association import MAX_GAP, assign_tracks
-from stillmap.tracking.clustering import DynamicPoints, _cluster
 from stillmap.tracking.fast_movers import find_fast_movers
 
 RATE = 10.0
@@ -17,9 +16,9 @@ def box_hits(x, y, length=4.4, width=1.8):
     """Ranges (n,) along ANGLES to a box along x whose center is given; inf: it is missed."""
     d = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
     with np.errstate(divide="ignore"):
-        t = np.stack([[(x - length / 2) / d[:, 0], (x + length / 2) / d[:, 0]],
-                      [(y - width / 2) / d[:, 1], (y + width / 2) / d[:, 1]]])  # fmt: skip
-    near, far = t.min(axis=1).max(axis=0), t.max(axis=1).min(axis=0)
+        half = np.array([length / 2, width / 2])
+        t = np.stack([([x, y] - half) / d, ([x, y] + half) / d])
+    near, far = t.min(axis=0).max(axis=1), t.max(axis=0).min(axis=1)
     return np.where((near <= far) & (near > 0), near, np.inf)
 
 
@@ -39,14 +38,10 @@ def driven(cars, seconds, robot_speed=6.0, people=()):
         seen = np.flatnonzero(r < 60.0)
         r = r[seen] + rng.normal(0.0, 0.02, len(seen))
         xy = sensor[s] + r[:, None] * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])[seen]
-        rows += [(s, *p, d, k) for p, d, k in zip(xy, r, who[seen], strict=True)]
-    scan, x, y, distance, who = np.array(rows).T
-    scan, xy = scan.astype(np.intp), np.column_stack([x, y])
-    first = np.searchsorted(scan, np.arange(len(t) + 1))
-    cluster = _cluster(scan, xy, distance)
-    return DynamicPoints(
-        t, scan, np.arange(len(scan)), xy, distance, sensor, cluster, first
-    ), who.astype(int)
+        rows.append(np.column_stack([np.full(len(seen), s), xy, who[seen]]))
+    scan, x, y, who = np.concatenate(rows).T
+    points = points_of(t, scan.astype(np.intp), np.column_stack([x, y]), sensor)
+    return points, who.astype(int)
 
 
 def found(points):
@@ -96,25 +91,18 @@ def test_somebody_on_the_pavement_keeps_his_track_while_a_car_passes():
     assert np.median(np.linalg.norm(path.velocity, axis=1)) == pytest.approx(10.0, abs=0.3)
 
 
-def test_people_are_no_fast_movers():
+@pytest.mark.parametrize(
+    ("n", "reach", "speed", "share"), [(12, 6.0, 1.6, 0.7), (40, 12.0, 0.0, 0.2)]
+)
+def test_people_and_hits_here_and_there_are_no_fast_movers(n, reach, speed, share):
     rng = np.random.default_rng(1)
-    begin, speed = rng.uniform(-6.0, 6.0, (12, 2)), rng.uniform(-1.6, 1.6, (12, 2))
-    ways = [lambda s, a=a, v=v: a + v * s for a, v in zip(begin, speed, strict=True)]
-    points, _ = watched(ways, visible=lambda *_: rng.random() < 0.7)
+    begin, velocity = rng.uniform(-reach, reach, (n, 2)), rng.uniform(-speed, speed, (n, 2))
+    ways = [lambda s, a=a, v=v: a + v * s for a, v in zip(begin, velocity, strict=True)]
+    points, _ = watched(ways, visible=lambda *_: rng.random() < share)
     before = assign_tracks(points, MAX_GAP)
     owner, paths = find_fast_movers(points, before)
     assert not paths
     assert np.array_equal(owner, before)
-
-
-def test_hits_here_and_there_are_no_fast_movers():
-    rng = np.random.default_rng(2)
-    places = rng.uniform(-12.0, 12.0, (40, 2))
-    points, _ = watched(
-        [lambda _, at=at: at for at in places], visible=lambda *_: rng.random() < 0.2
-    )
-    _, paths = found(points)
-    assert not paths
 
 
 @pytest.mark.parametrize("pairs", [1, 7])

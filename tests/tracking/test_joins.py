@@ -23,34 +23,35 @@ def join(*pieces, is_fast=False):
     return mover.tolist(), p
 
 
-def test_who_goes_on_behind_something_is_the_same():
-    mover, p = join((0, 3, (0, 0), (1, 0), 0.4), (4.4, 8, (0, 0), (1, 0), 0.4))
-    assert mover == [0, 0]
-    assert 0.9 < p[0] < 1.0
-    assert p[1] == 1.0
+BEFORE = (0, 3, (0, 0), (1, 0), 0.4)
+ONE, OTHER = ((-4, 0), (1, 0.3), 0.4), ((4, 0), (-1, 0.3), 0.4)  # they meet at 4 s
 
 
-def test_who_appears_elsewhere_is_another():
-    mover, p = join((0, 3, (0, 0), (1, 0), 0.4), (4.4, 8, (0, 3), (1, 0), 0.4))
-    assert mover == [0, 1]
-    assert p.tolist() == [1.0, 1.0]
-
-
-def test_velocities_before_and_after_say_who_is_who():
-    # they meet at 4 s: the nearest piece is that of the other
-    one, other = ((-4, 0), (1, 0.3)), ((4, 0), (-1, 0.3))
-    mover, p = join(
-        *((0, 3.5, *way, 0.4) for way in (one, other)),
-        *((4.5, 8, *way, 0.4) for way in (other, one)),
-    )
-    assert mover == [0, 1, 1, 0]
-    assert (p[:2] > 0.9).all()
+@pytest.mark.parametrize(
+    ("pieces", "expected", "least", "most"),
+    [
+        ([BEFORE, (4.4, 8, *BEFORE[2:])], [0, 0], 0.9, 0.999),
+        ([BEFORE, (4.4, 8, (0, 3), (1, 0), 0.4)], [0, 1], 1.0, 1.0),  # who appears elsewhere
+        # the nearest piece is that of the other: velocities say who is who
+        (
+            [(0, 3.5, *ONE), (0, 3.5, *OTHER), (4.5, 8, *OTHER), (4.5, 8, *ONE)],
+            [0, 1, 1, 0],
+            0.9,
+            1.0,
+        ),
+        # each piece goes on in one
+        ([BEFORE, *((3.6, 8, (0, y), (1, 0), 0.4) for y in (0.0, 0.3, -0.3))], [0, 0, 2, 3], 0, 1),
+    ],
+)
+def test_who_goes_on_as_whom(pieces, expected, least, most):
+    mover, p = join(*pieces)
+    assert mover == expected
+    assert ((p[: len(pieces) // 2] >= least) & (p[: len(pieces) // 2] <= most)).all()
 
 
 def test_who_could_be_either_is_joined_without_certainty():
-    ways = [((0, 0.2), (1, 0)), ((0, -0.2), (1, 0))]
     mover, p = join(
-        *((0, 3, *way, 0.4) for way in ways),
+        *((0, 3, (0, y), (1, 0), 0.4) for y in (0.2, -0.2)),
         *((4.6, 8, (0, y), (1, 0), 0.4) for y in (0.05, -0.05)),
     )
     assert sorted(mover) == [0, 0, 1, 1]
@@ -70,14 +71,6 @@ def test_width_decides_where_motion_does_not(thin_first):
 def test_a_vehicle_that_is_hidden_is_the_same():
     pieces = ((0, 2, (0, 0), (9, 0), 1.0), (3, 5, (0, 0), (9, 0), 1.0))
     assert join(*pieces, is_fast=True)[0] == [0, 0]
-
-
-def test_each_piece_goes_on_in_one():
-    mover, _ = join(
-        (0, 3, (0, 0), (1, 0), 0.4),
-        *((3.6, 8, (0, y), (1, 0), 0.4) for y in (0.0, 0.3, -0.3)),
-    )
-    assert mover == [0, 0, 2, 3]
 
 
 def test_nothing_to_join():

@@ -16,15 +16,11 @@ NOISE_STD = 0.01  # m
 RATE = 10.0
 
 
-def evidence(**changes):
-    """One track: 40 looks at something thick, seen from first to last, that stands."""
+def log_ratio(**changes):
+    """Of one track: 40 looks at something thick, seen from first to last, that stands."""
     usual = {"looks": 40, "hits": 6, "missed": 0, "windows": 3, "moving": 0, "open_ends": 0}
     values = (usual | {"slides": 0} | changes).values()
-    return TrackEvidence(*(np.array([float(x)]) for x in values))
-
-
-def log_ratio(**changes):
-    return float(compute_log_ratio(evidence(**changes))[0])
+    return float(compute_log_ratio(TrackEvidence(*(np.array([float(x)]) for x in values)))[0])
 
 
 def test_each_kind_of_evidence_counts_in_its_direction():
@@ -66,12 +62,16 @@ def recorded(things, seconds=20.0):
     return recording, who.ravel()
 
 
+def apply(recording, p_static):
+    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
+    return apply_motion_evidence(recording, poses, p_static, NOISE_STD)
+
+
 def judged(things):
     """P(static) of the beams on each thing afterwards, and the movers; before it was 0.05."""
     recording, who = recorded(things)
     p_static = np.where(who >= 0, 0.05, 0.95).astype(np.float32)
-    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    found, movers = apply_motion_evidence(recording, poses, p_static, NOISE_STD)
+    found, movers = apply(recording, p_static)
     assert np.array_equal(found[who < 0], p_static[who < 0])
     return [float(found[who == i].mean()) for i in range(len(things))], movers
 
@@ -114,8 +114,7 @@ def test_one_who_stands_among_walkers_is_a_mover():
 def test_no_dynamic_beams_no_work():
     recording, who = recorded([walker(2.0)])
     p_static = np.ones(len(who), np.float32)
-    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    found, movers = apply_motion_evidence(recording, poses, p_static, NOISE_STD)
+    found, movers = apply(recording, p_static)
     assert np.array_equal(found, p_static)
     assert len(movers.xy) == 0
 
@@ -134,7 +133,6 @@ def test_a_walker_is_dynamic_where_his_cells_do_not_say_so():
     scan = np.repeat(np.arange(recording.n_scans), len(ANGLES))
     unknown = (who == 0) & (scan % 4 == 0)
     p_static[unknown] = 0.8
-    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    found, _ = apply_motion_evidence(recording, poses, p_static, NOISE_STD)
+    found, _ = apply(recording, p_static)
     assert np.mean(found[unknown] < 0.5) > 0.9
     np.testing.assert_array_equal(found[who < 0], p_static[who < 0])
