@@ -16,8 +16,8 @@ def box_hits(x, y, length=4.4, width=1.8):
     """Ranges (n,) along ANGLES to a box along x whose center is given; inf: it is missed."""
     d = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
     with np.errstate(divide="ignore"):
-        half = np.array([length / 2, width / 2])
-        t = np.stack([([x, y] - half) / d, ([x, y] + half) / d])
+        at, half = np.array([x, y]), np.array([length, width]) / 2
+        t = np.stack([(at - half) / d, (at + half) / d])
     near, far = t.min(axis=0).max(axis=1), t.max(axis=0).min(axis=1)
     return np.where((near <= far) & (near > 0), near, np.inf)
 
