@@ -8,7 +8,7 @@ import pytest
 
 from stillmap.results.objects import write_objects, write_ply, write_traffic
 from stillmap.results.report.figures import draw_map, map_window
-from stillmap.results.report.objects import draw_traffic
+from stillmap.results.report.maps import draw_traffic
 from stillmap.results.report.page import render_report
 from stillmap.tracking import ObjectOptions, compute_flow_map
 

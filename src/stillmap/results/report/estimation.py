@@ -77,8 +77,8 @@ def convergence_data(result: MappingResult) -> dict[str, Any] | None:
     if not iterations:
         return None
     finite = [it for it in iterations if math.isfinite(it.bound)]
-    held_out = {it.number: it.held_out_log_likelihood for it in iterations}
-    kept = held_out.get(result.best_iteration)
+    best = [it for it in iterations if it.number == result.best_iteration]
+    kept = best[0].held_out_log_likelihood if best else None
     numbers = [it.number for it in iterations]
     curves = [
         curve_of(numbers, values, result.best_iteration)
@@ -88,15 +88,6 @@ def convergence_data(result: MappingResult) -> dict[str, Any] | None:
         )
     ]
     return {
-        "iterations": [
-            {
-                "number": it.number,
-                "likelihoods": (it.expected_log_likelihood, it.bound, it.held_out_log_likelihood),
-                "changed": it.changed_share,
-                "seconds": it.seconds,
-            }
-            for it in iterations
-        ],
         # (iteration, relative decrease)
         "falls": [
             (after.number, (before.bound - after.bound) / max(abs(before.bound), 1e-300))

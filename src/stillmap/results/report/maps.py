@@ -1,20 +1,18 @@
-"""Maps of the report: as written, raw beside clean, over the iterations, and changed places."""
+"""Maps of the report: as written, raw beside clean, what changed and moved, the iterations."""
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core.grid_map import GridMap
-from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
-from stillmap.pipeline.snapshots import Snapshot, Window, extent
+from stillmap.pipeline.snapshots import Window, extent
 from stillmap.results.map_server import CHANGED, changed_cells, trinary_pixels
 from stillmap.results.report.figures import (
     UNKNOWN_LEVEL,
@@ -30,14 +28,23 @@ from stillmap.results.report.figures import (
     reduce_levels,
     reduce_squares,
 )
-from stillmap.results.run_json import known_area
+from stillmap.results.run_json import known_area, tilting_record
+from stillmap.tracking import FlowMap
+from stillmap.tracking.objects import mean_speed, track_length
+
+if TYPE_CHECKING:
+    from stillmap.pipeline.tilting import TiltingResult
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # pixels of map.pgm
 _MAX_EDGE = 4096  # pixels; a trinary map of that size takes a few hundred kB as PNG
 # of occupancy in percent as `--map-mode scale` writes it, and of unknown cells
 _PERCENT_GREYS = [round(255 * (1 - percent / 100)) for percent in range(UNKNOWN_LEVEL)] + [UNKNOWN]
 _MAX_PATH_POINTS = 3000
-_MAX_ROWS = 50
+_MAX_ROWS, _MAX_TRACKS, _MAX_OBJECTS = 50, 500, 25  # shown of changes, tracks, rows of objects
+_TRAFFIC_COLORS = 64
+# of cells crossed once, and of those crossed most often
+_PALE, _DARK = np.array([255.0, 226.0, 178.0]), np.array([150.0, 20.0, 10.0])
+_WALL = 90  # grey level up to which a pixel stays visible as a wall
 _COLORS = {
     "came": (20, 120, 60),
     "left": (190, 40, 120),
@@ -90,48 +97,36 @@ def _reduce_states(p_occupied: NDArray[np.float32], factor: int) -> NDArray[np.u
     return np.where(occupied, 0, np.where(free, 2, 1)).astype(np.uint8)
 
 
-class MapFigure(NamedTuple):
-    """The filtered map as several sections show it: its view, picture and `data:` URI."""
-
-    view: MapView
-    picture: Image.Image
-    uri: str
-
-
-def draw_filtered_map(result: MappingResult) -> MapFigure | None:
-    """The filtered map in the window that also holds the raw one; None for a map without cells."""
+def draw_filtered_map(result: MappingResult) -> tuple[MapView, Image.Image] | None:
+    """The filtered map in the view that also holds the raw one; None for a map without cells."""
     if not result.map.p_occupied.size:
         return None
     view = MapView.of([result.raw_map, result.map])
-    picture = draw_map(result.map, view.window)
-    return MapFigure(view, picture, data_uri(picture))
+    return view, draw_map(result.map, view.window)
 
 
-def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any] | None:
-    """The map as written, and the raw one beside the filtered one (Figs. 4, 6, 7).
-
-    None for a map without cells.
-    """
-    if filtered is None:
-        return None
-    view = filtered.view
-    ends = sample_dynamic_points(result.deskewed, result.poses, result.p_static)[:, :2]
+def map_data(result: MappingResult, view: MapView, filtered: Image.Image) -> dict[str, Any]:
+    """The map as written, and the raw one beside the filtered one (Figs. 4, 6, 7)."""
+    thin, area = result.evidence.thinly_observed, known_area(result)
     every = max(1, math.ceil(len(result.poses) / _MAX_PATH_POINTS))
-    area = known_area(result)
     return {
         **written_map_data(result.map, result.options.output.map_mode, view),
         "raw": data_uri(draw_map(result.raw_map, view.window)),
-        "filtered": filtered.uri,
-        "dynamic": data_uri(draw_points(ends, view)),
-        "thinly_observed": data_uri(
-            draw_thinly_observed(result.map, result.evidence.thinly_observed, view.window)
-        ),
+        "filtered": data_uri(filtered),
+        "dynamic": draw_dynamic(result, view),
+        "thinly_observed": data_uri(draw_thinly_observed(result.map, thin, view.window)),
         "path": view.svg_points(result.poses[::every, :2, -1]),
         "known_area": area["known"],
         "thinly_observed_area": area["thin"],
         "min_observations": result.evidence.min_observations,
         "radius": result.evidence.mover_radius,
     }
+
+
+def draw_dynamic(result: "MappingResult | TiltingResult", view: MapView) -> str:
+    """`data:` URI of the dynamic returns as a layer over the map."""
+    ends = sample_dynamic_points(result.deskewed, result.poses, result.p_static)[:, :2]
+    return data_uri(draw_points(ends, view))
 
 
 def written_map_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
@@ -158,37 +153,22 @@ def written_map_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[s
     }
 
 
-def changes_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any] | None:
-    """Changed places on the map and in a table; None where there are none."""
-    if not result.changes or filtered is None:
+def changes_data(result: MappingResult, view: MapView) -> dict[str, Any] | None:
+    """Changed places on the map and for a table; None where there are none."""
+    if not result.changes:
         return None
-    view = filtered.view
     largest = sorted(range(len(result.changes)), key=lambda k: -len(result.changes[k].cells))
     listed = [result.changes[k] for k in sorted(largest[:_MAX_ROWS])]
     corners = np.array([(one.x + one.size[0] / 2, one.y) for one in listed])
     counts = Counter[str](one.kind for one in result.changes)
     return {
-        "view": view,
-        "map": filtered.uri,
         "marks": data_uri(draw_changes(result, view)),
         "numbers": view.to_pixels(corners).tolist(),
         "colors": _COLORS,
         "counts": [(kind, counts[kind]) for kind in CHANGED if counts[kind]],
         "total": len(result.changes),
-        "listed": [_change_row(one, int(result.recording.stamp_ns[0])) for one in listed],
-    }
-
-
-def _change_row(change: Change, start_ns: int) -> dict[str, Any]:
-    center = (change.x, change.y) if change.z is None else (change.x, change.y, change.z)
-    return {
-        "kind": change.kind,
-        "center": ", ".join(f"{v:.2f}" for v in center),
-        "size": " x ".join(f"{v:.2f}" for v in change.size),
-        "cells": len(change.cells),
-        "before_ns": change.before_ns - start_ns,
-        "after_ns": change.stamp_ns - start_ns,
-        "times": change.times,
+        "listed": listed,
+        "start_ns": int(result.recording.stamp_ns[0]),
     }
 
 
@@ -203,20 +183,71 @@ def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
     return color_by_index(np.concatenate(strips)[::-1], colors, 0)
 
 
+def objects_data(
+    result: MappingResult, view: MapView, filtered: Image.Image
+) -> dict[str, Any] | None:
+    """Tracks and traffic on the map; None where objects were not tracked."""
+    if not result.options.objects.enabled:
+        return None
+    rows = [
+        (
+            one,
+            track_length(one.xy),
+            mean_speed(one.velocity),
+            1e-9 * float(one.stamp_ns[-1] - one.stamp_ns[0]),
+        )
+        for one in result.objects
+    ]
+    if not rows:
+        return {"total": 0}
+    rows.sort(key=lambda row: row[1], reverse=True)
+    objects, _, speeds, seconds = zip(*rows, strict=True)
+    return {
+        "total": len(rows),
+        "returns": sum(len(one.beams) for one in objects),
+        "median_seconds": float(np.median(seconds)),
+        "median_speed": float(np.median(speeds)),
+        "tracks": [view.svg_points(one.xy) for one in objects[:_MAX_TRACKS]],
+        "traffic": data_uri(draw_traffic(result.traffic, filtered, view.window)),
+        "traffic_cell": result.traffic.resolution,
+        "max_crossings": int(result.traffic.crossings.max()),
+        "listed": rows[:_MAX_OBJECTS],
+    }
+
+
+def draw_traffic(traffic: FlowMap, picture: Image.Image, window: Window) -> Image.Image:
+    """The map's `picture` of a window with the crossed cells colored, on a logarithmic scale."""
+    image = np.array(picture.convert("RGB"))
+    height, width = image.shape[:2]
+    x0, y0, x1, y1 = window
+    x = x0 + (np.arange(width) + 0.5) * (x1 - x0) / width
+    y = y1 - (np.arange(height) + 0.5) * (y1 - y0) / height
+    padded = np.pad(traffic.crossings, 1)  # zero outside the grid
+    column = np.floor((x - traffic.origin[0]) / traffic.resolution).astype(np.int64) + 1
+    row = np.floor((y - traffic.origin[1]) / traffic.resolution).astype(np.int64) + 1
+    row, column = row.clip(0, padded.shape[0] - 1), column.clip(0, padded.shape[1] - 1)
+    crossings = padded[row[:, None], column]
+    colored = (crossings > 0) & (image.min(axis=2) > _WALL)
+    share = np.log1p(crossings[colored]) / np.log1p(max(int(traffic.crossings.max()), 1))
+    image[colored] = (_PALE + share[:, None] * (_DARK - _PALE)).astype(np.uint8)
+    return Image.fromarray(image).quantize(_TRAFFIC_COLORS)
+
+
+def rig_data(tilting: "TiltingResult", view: MapView | None) -> dict[str, Any]:
+    """Counts of the second laser and its dynamic returns on the map of the first."""
+    dynamic = None if view is None else draw_dynamic(tilting, view)
+    return {"record": tilting_record(tilting), "dynamic": dynamic}
+
+
 def evolution_data(result: MappingResult) -> dict[str, Any] | None:
     """The part of the map with most dynamic returns over the iterations (Fig. 8)."""
-    snapshots: Sequence[Snapshot] = result.snapshots
-    if not snapshots or not snapshots[0].p_occupied.size:
+    if not result.snapshots or not result.snapshots[0].p_occupied.size:
         return None
+    first, pictures = result.snapshots[0], map(draw_snapshot, result.snapshots)
     return {
-        "meters": [n * snapshots[0].resolution for n in snapshots[0].p_occupied.shape[::-1]],
+        "meters": [n * first.resolution for n in first.p_occupied.shape[::-1]],
         "snapshots": [
-            {
-                "number": one.number,
-                "dynamic": len(one.dynamic_points),
-                "view": MapView(extent(one), (image := draw_snapshot(one)).size),
-                "image": data_uri(image),
-            }
-            for one in snapshots
+            (one, MapView(extent(one), picture.size), data_uri(picture))
+            for one, picture in zip(result.snapshots, pictures, strict=True)
         ],
     }

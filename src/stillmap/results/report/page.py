@@ -16,8 +16,10 @@ from stillmap.results.report.maps import (
     draw_filtered_map,
     evolution_data,
     map_data,
+    objects_data,
+    rig_data,
 )
-from stillmap.results.report.objects import objects_data, rig_data
+from stillmap.results.report.point_view import points_data
 from stillmap.results.report.template import render_page
 from stillmap.results.run_json import models_record
 
@@ -77,17 +79,21 @@ def render_report(
         models: of the place and of moving objects.
         folder: the result folder, to whose files the page links; None: no links.
     """
-    filtered = draw_filtered_map(result)
+    figure = draw_filtered_map(result)
     data = {
+        "result": result,
         "run": (run := _run_data(result)),
         "title": run["name"],
-        "maps": map_data(result, filtered),
-        "quality": _quality_data(result),
+        "quality": [
+            (name, getattr(result.quality, name), line)
+            for name, line in describe_quality(result.quality).items()
+        ],
         "files": files_data(folder),
-        "changes": changes_data(result, filtered),
-        "objects": objects_data(result, filtered),
-        "points": _points_data(result, tilting),
-        "rig": rig_data(tilting, filtered),
+        "maps": None if figure is None else map_data(result, *figure),
+        "changes": None if figure is None else changes_data(result, figure[0]),
+        "objects": None if figure is None else objects_data(result, *figure),
+        "points": points_data(result, tilting),
+        "rig": None if tilting is None else rig_data(tilting, figure and figure[0]),
         "models": None if models is None else _models_data(models),
         "fitted": fitted_data(result),
         "calibration": calibration_data(result),
@@ -98,15 +104,6 @@ def render_report(
         "options": [(one.name, one.value) for one in iter_options(result.options)],
     }
     return render_page(data)
-
-
-def _points_data(result: MappingResult, tilting: "TiltingResult | None") -> dict[str, Any] | None:
-    """See `point_view.points_data`, whose renderer is loaded only for results in 3D."""
-    if tilting is None and result.recording.dimension == 2:
-        return None
-    from stillmap.results.report.point_view import points_data
-
-    return points_data(result, tilting)
 
 
 def _models_data(models: "Models") -> dict[str, Any]:
@@ -127,38 +124,15 @@ def _run_data(result: MappingResult) -> dict[str, Any]:
         "name": Path(path).name or "recording",
         "path": path,
         "format": source.format or "",
-        "scans": result.recording.n_scans,
-        "skipped": source.n_skipped,
         "beams": count_beams(result.recording, result.p_static),
         "duration": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
         "seconds": sum(float(stage.get("seconds") or 0) for stage in stages.values()),
         "memory": max(
             (stage.get("peak_memory_bytes") or 0 for stage in stages.values()), default=0
         ),
-        "iterations": len(result.iterations),
-        "best": result.best_iteration,
-        "converged": result.converged,
         "warnings": [(what, todo) for what, todo in findings if todo],
         "notes": [what for what, todo in findings if not todo],
-        "estimator": result.options.estimator,
-        "dimension": result.recording.dimension,
-        "map_state": result.options.output.map_state,
     }
-
-
-def _quality_data(result: MappingResult) -> list[tuple[str, float | None, str]]:
-    """Each part of the quality: its name, from 0 to 100 (None: unknown), and words."""
-    quality, words = result.quality, describe_quality(result.quality)
-    return [
-        ("Overall", quality.overall, _sentence_of(words["overall"])),
-        ("Labels", quality.labels, _sentence_of(words["labels"])),
-        ("Geometry", quality.geometry, _sentence_of(words["geometry"])),
-    ]
-
-
-def _sentence_of(line: str) -> str:
-    """The words that follow the name and the figure of a part."""
-    return line.partition(": ")[2]
 
 
 def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[tuple[str, str]]:

@@ -195,20 +195,15 @@ def _step_data(timeline: Timeline, number: int, pictures: "PlacePictures | None"
 
 
 def _change_row(change: SessionChange, timeline: Timeline) -> dict[str, Any]:
-    def center(low: Float, high: Float) -> str:
-        return ", ".join(f"{v:.2f}" for v in 0.5 * (low + high))
-
     (low, high), *earlier = change.boxes
     names = [one.name for one in timeline.sessions]
     before, after = (names.index(name) for name in change.between)
     return {
-        "label": change.label,
-        "kind": change.kind,
-        "center": center(low, high),
-        "start": center(*earlier[0]) if earlier else "",
-        "size": " x ".join(f"{v:.2f}" for v in high - low),
+        "change": change,
+        "center": 0.5 * (low + high),
+        "start": 0.5 * sum(earlier[0]) if earlier else None,
+        "size": high - low,
         "since": "" if before == after - 1 else change.between[0],
-        "probability": change.probability,
     }
 
 

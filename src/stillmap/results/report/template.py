@@ -4,7 +4,7 @@ import base64
 import functools
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ def render_page(data: Mapping[str, Any], template: str = "report.html.j2") -> st
     script = (_TEMPLATES / "map_view.js").read_text(encoding="utf-8")
     # without its hash, browsers run no script of the page
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    known = {"run": None, "place": None, "script": script, "script_hash": digest}
+    known = {"run": None, "result": None, "place": None, "script": script, "script_hash": digest}
     page = _environment().get_template(template)
     return page.render({**known, **data, "version": package_version()})
 
@@ -92,6 +92,11 @@ def format_scalar(value: object) -> str:
     return f"{value:.7g}" if isinstance(value, float) else str(value)
 
 
+def format_lengths(values: Iterable[float | None], separator: str = ", ") -> str:
+    """Lengths with two decimals, those that are not None."""
+    return separator.join(f"{value:.2f}" for value in values if value is not None)
+
+
 def format_sentence(text: str) -> str:
     """A text with a full stop; the style sheet shows its first letter as a capital."""
     return text + "." * (text[-1:] not in ".?!")
@@ -104,6 +109,7 @@ FILTERS = {
     "number": format_number,
     "clock": format_clock,
     "scalar": format_scalar,
+    "lengths": format_lengths,
     "sentence": format_sentence,
     "comma": "{:,}".format,
 }
