@@ -27,7 +27,7 @@ from tables import Column, Row, grouped, markdown
 
 import stillmap
 from stillmap import em, slam
-from stillmap.results.eval.relations import compute_relation_errors
+from stillmap.results.eval.trajectory import compute_relation_errors
 from stillmap.sim import simulate
 
 Float = NDArray[np.float64]

@@ -18,7 +18,7 @@ import stillmap
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams, replay
 from stillmap.results.eval.readers import read_planar_trajectory, read_relations
-from stillmap.results.eval.relations import compute_relation_errors
+from stillmap.results.eval.trajectory import compute_relation_errors
 
 Float = NDArray[np.float64]
 _LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")

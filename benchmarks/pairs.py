@@ -1,6 +1,6 @@
 """Relations between poses: pairs of scans of one place, from the truth or from files beside a log.
 
-As Kuemmerle et al. 2009 judge trajectories, see `stillmap.results.eval.relations`.
+As Kuemmerle et al. 2009 judge trajectories, see `stillmap.results.eval.trajectory`.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from stillmap.core import se2
 from stillmap.results.eval.readers import read_relations, to_seconds
-from stillmap.results.eval.relations import RelationErrors, compute_relation_errors
+from stillmap.results.eval.trajectory import RelationErrors, compute_relation_errors
 from stillmap.sim import load_truth
 from stillmap.sim.truth import FOLDER
 

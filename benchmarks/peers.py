@@ -31,7 +31,7 @@ from tables import markdown
 
 import stillmap
 from stillmap.results.eval.readers import read_planar_trajectory
-from stillmap.results.eval.relations import RelationErrors, compute_relation_errors
+from stillmap.results.eval.trajectory import RelationErrors, compute_relation_errors
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,11 +45,11 @@ from session_sets import LASER, PairSet, prepare_days, prepare_pairs
 from tables import markdown
 
 from stillmap.results.eval.readers import read_planar_trajectory, read_relations, read_trajectory
-from stillmap.results.eval.relations import compute_relation_errors
 from stillmap.results.eval.trajectory import (
     ErrorStats,
     associate_trajectories,
     compute_absolute_errors,
+    compute_relation_errors,
 )
 from stillmap.sim import scene_by_name, simulate, write_simulation
 

@@ -132,7 +132,7 @@ def test_a_session_is_converted_in_the_frame_of_the_place(call, flat_place, tmp_
 
 def test_a_cloud_of_a_place_in_3d(call, flat_place, tmp_path):
     """Of the points that the place itself has: no recording is read."""
-    from stillmap.results.points import ply_header
+    from stillmap.results.point_cloud import ply_header
 
     copy = tmp_path / "place"
     shutil.copytree(flat_place, copy)

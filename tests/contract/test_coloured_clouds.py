@@ -8,7 +8,7 @@ import trimesh
 
 from stillmap.results import point_cloud
 from stillmap.results.export import point_cloud_files
-from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.results.point_cloud import COLOURS, FIELDS, ply_header, put_colours
 
 N = 70_000
 

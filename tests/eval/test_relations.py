@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stillmap.results.eval.readers import read_odometry, read_planar_trajectory, read_relations
-from stillmap.results.eval.relations import RelationErrors, compute_relation_errors
+from stillmap.results.eval.trajectory import RelationErrors, compute_relation_errors
 
 
 def relation(t1: float, t2: float, x: float, y: float, yaw: float) -> list[float]:

@@ -32,8 +32,14 @@ from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KeptCloud, KeptMap, KnownMap, extend_map, write_extended_cloud
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
-from stillmap.results.point_cloud import Block, cloud_from_folder
-from stillmap.results.points import FIELDS, coordinate_fields, make_vertices, ply_header
+from stillmap.results.point_cloud import (
+    FIELDS,
+    Block,
+    cloud_from_folder,
+    coordinate_fields,
+    make_vertices,
+    ply_header,
+)
 
 EDGE = 0.15  # m, of a voxel
 

@@ -114,7 +114,7 @@ def test_a_region_is_in_the_map_frame(room):
     chosen = dataclasses.replace(chosen, output=output)
     poses = shift(from_zero(room.truth.T_world_base))
     result = stillmap.build(room.recording, chosen, poses=poses)
-    from stillmap.results.region import crop_result
+    from stillmap.results.writer import crop_result
 
     cropped = crop_result(result.mapping)
     assert cropped.map.origin[:2] == pytest.approx(region[:2], abs=1e-6)

@@ -12,7 +12,7 @@ from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.io.trajectory import read_tum
 from stillmap.results.reader import read_grid, read_labels
-from stillmap.results.report.place_pictures import PlacePictures
+from stillmap.results.report.place import PlacePictures
 from stillmap.results.timeline import read_timeline
 
 # what a result of one recording has, and what a place adds

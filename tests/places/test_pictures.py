@@ -13,7 +13,7 @@ from small_place import BOX, CELL, CHAIR, DOOR, OPEN, ORIGIN, SIZE, make_place
 
 from stillmap.results.colors import KIND_COLORS
 from stillmap.results.reader import read_grid
-from stillmap.results.report.place_pictures import PlacePictures
+from stillmap.results.report.place import PlacePictures
 from stillmap.results.timeline import read_timeline
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)

@@ -11,7 +11,7 @@ from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 from stillmap.results.eval.readers import read_odometry, read_relations, to_seconds
-from stillmap.results.eval.relations import compute_relation_errors
+from stillmap.results.eval.trajectory import compute_relation_errors
 
 pytestmark = pytest.mark.slow
 

@@ -11,9 +11,8 @@ from stillmap import io as recordings
 from stillmap.core import se2
 from stillmap.core.arrays import write_npz
 from stillmap.io.trajectory import poses_from_tum, write_tum
-from stillmap.results.points import write_clouds
-from stillmap.results.viewer.beams import Beams
-from stillmap.results.viewer.scene import read_scene
+from stillmap.results.point_cloud import write_clouds
+from stillmap.results.viewer.scene import Beams, read_scene
 from stillmap.results.writer import write_labels
 from stillmap.slam import SlamOptions
 

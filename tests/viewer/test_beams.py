@@ -6,7 +6,7 @@ import pytest
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.results.viewer import beams as viewer_beams
-from stillmap.results.viewer.beams import Beams
+from stillmap.results.viewer.scene import Beams
 from stillmap.slam import SlamOptions, deskew_recording
 
 

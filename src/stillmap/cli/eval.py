@@ -26,7 +26,7 @@ EPILOG = """examples:
 
 def _score_relations(args: argparse.Namespace) -> dict[str, Any]:
     from stillmap.results.eval import readers
-    from stillmap.results.eval.relations import compute_relation_errors
+    from stillmap.results.eval.trajectory import compute_relation_errors
 
     errors = compute_relation_errors(
         readers.read_planar_trajectory(Path(args.trajectory)),

@@ -28,7 +28,7 @@ from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import interpret
 from stillmap.prepare.time_window import TimeWindow, select_time
 from stillmap.results.reader import read_run
-from stillmap.results.region import crop_result, require_overlap
+from stillmap.results.writer import crop_result, require_overlap
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models

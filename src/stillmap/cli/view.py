@@ -13,8 +13,7 @@ from stillmap.core.errors import InputError, MissingExtra, import_extra, printab
 from stillmap.core.profiling import is_terminal
 
 if TYPE_CHECKING:
-    from stillmap.results.viewer.beams import Beams
-    from stillmap.results.viewer.scene import Scene
+    from stillmap.results.viewer.scene import Beams, Scene
 
 
 _REPORT, _LAST_PORT = "report.html", 65_535
@@ -146,8 +145,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
 def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beams | None"]:
     """The result of one recording; without beams where that cannot be read and is not named."""
     from stillmap.results.folder import open_result
-    from stillmap.results.viewer.beams import Beams
-    from stillmap.results.viewer.scene import read_scene
+    from stillmap.results.viewer.scene import Beams, read_scene
 
     result = open_result(folder, args.input)
     scene = read_scene(folder, result.sources[0].name)

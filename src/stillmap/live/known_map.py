@@ -27,8 +27,7 @@ from stillmap.places.surface_map import SurfaceMap, find_sides
 from stillmap.results import reader
 from stillmap.results.folder import ResultFolder
 from stillmap.results.map_server import write_map_npz, write_map_server
-from stillmap.results.point_cloud import Block, cloud_from_folder
-from stillmap.results.points import append_vertices
+from stillmap.results.point_cloud import Block, append_vertices, cloud_from_folder
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, RECORD, Grid, read_run
 from stillmap.slam import scan_hits
 

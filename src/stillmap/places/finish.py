@@ -48,7 +48,7 @@ from stillmap.places.store import (
     write_ties,
 )
 from stillmap.results.map_server import write_map_npz, write_map_server
-from stillmap.results.points import write_clouds
+from stillmap.results.point_cloud import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, count_labels, read_labels
 from stillmap.results.report.place import render_place_report

@@ -14,7 +14,7 @@ from stillmap.core.json import read_json
 from stillmap.core.local_frame import LocalFrame
 from stillmap.places.place import Place, PlacedSession, fit_alignment
 from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_traffic
-from stillmap.results.points import coordinate_fields, ply_header
+from stillmap.results.point_cloud import coordinate_fields, ply_header
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import write_npz
 from stillmap.core.local_frame import FAR
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.points import Fields, coordinate_fields, ply_header
+from stillmap.results.point_cloud import Fields, coordinate_fields, ply_header
 from stillmap.results.reader import Track
 from stillmap.tracking import FlowMap, MovingObject
 

@@ -1,32 +1,39 @@
-"""The result folder: every file of a run, appearing together or not at all."""
+"""The result folder: every file of a run, limited to a region, appearing together or not at all."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import write_arrays
+from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, write_text
-from stillmap.core.grid_map import Region, limit_hits
+from stillmap.core.grid_map import GridMap, Region, is_inside, limit_hits
 from stillmap.core.json import write_json
 from stillmap.core.recording import Recording
+from stillmap.core.tiles import Block, cut
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.snapshots import extent
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.objects import write_objects, write_traffic
-from stillmap.results.points import write_clouds
+from stillmap.results.point_cloud import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.reader import RECORD, TILTING
-from stillmap.results.region import crop_result, passes
 from stillmap.results.report.page import render_report
 from stillmap.results.run_json import models_record, run_record, tilting_record
+from stillmap.tracking import FlowMap, MovingObject
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
     from stillmap.pipeline.tilting import TiltingResult
+
+Some = TypeVar("Some", bound=MappingResult)
+_MAP_LAYERS = ("p_occupied", "alpha", "beta")
+_EVIDENCE_LAYERS = ("observations", "unobstructed", "thinly_observed")
 
 
 def save(
@@ -134,3 +141,83 @@ def _write_tilting(
     write_labels(inside / "beams", tilting.recording, tilting.p_static, colors)
     write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, tilting.poses)
     write_objects(inside / "objects", tilting)
+
+
+def require_overlap(occupancy: GridMap, region: Region | None) -> None:
+    """Refuse a region that shows nothing of a map.
+
+    Raises:
+        InputError: names the extent of the map.
+    """
+    if region is not None and _cells(occupancy, region) is None:
+        x0, y0, x1, y1 = (f"{value:.2f}" for value in extent(occupancy))
+        wanted = " ".join(f"{value:g}" for value in region)
+        raise InputError(
+            f"the region {wanted} lies outside the map",
+            hint=f"the map spans {x0} to {x1} m in x, {y0} to {y1} m in y",
+        )
+
+
+def passes(one: MovingObject, region: Region | None) -> bool:
+    """True if an object was in a region at any time; true without a region."""
+    return region is None or bool(is_inside(one.xy, region).any())
+
+
+def crop_result(result: Some) -> Some:
+    """The maps, changes, objects and traffic in the region of the options; all without one.
+
+    Raises:
+        InputError: the region lies outside the map.
+    """
+    region = result.options.output.region
+    if region is None:
+        return result
+    require_overlap(result.map, region)
+    block = _cells(result.map, region)
+    assert block is not None
+    scratch, corner = result.recording.scratch, _corner(result.map, block)
+
+    def crop(layers: Any, names: tuple[str, ...], **more: Any) -> Any:
+        parts = {name: cut(getattr(layers, name), block, scratch) for name in names}
+        return replace(layers, **parts, **more)
+
+    maps = replace(
+        result.maps,
+        filtered=crop(result.map, _MAP_LAYERS, origin=corner),
+        raw=crop(result.raw_map, _MAP_LAYERS, origin=corner),
+        evidence=crop(result.evidence, _EVIDENCE_LAYERS),
+    )
+    return replace(
+        result,
+        maps=maps,
+        changes=[one for one in result.changes if is_inside(np.array([one.x, one.y]), region)],
+        doors=[one for one in result.doors if is_inside(np.array(one.hinge), region)],
+        objects=[one for one in result.objects if passes(one, region)],
+        traffic=_crop_traffic(result.traffic, region),
+    )
+
+
+def _cells(occupancy: GridMap | FlowMap, region: Region) -> Block | None:
+    """Rows and columns of the cells that a region overlaps; None: none."""
+    layer = occupancy.crossings if isinstance(occupancy, FlowMap) else occupancy.p_occupied
+    size, corner = occupancy.resolution, np.array(occupancy.origin[:2])
+    # a limit on the edge of a cell, as map.yaml has them, is not to take in the next cell
+    first = np.floor((np.array(region[:2]) - corner) / size + 1e-6).astype(int)
+    last = np.ceil((np.array(region[2:]) - corner) / size - 1e-6).astype(int)
+    first, last = np.maximum(first, 0), np.minimum(last, layer.shape[::-1])
+    if (first >= last).any():
+        return None
+    return slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
+
+
+def _corner(occupancy: GridMap | FlowMap, block: Block) -> tuple[float, float, float]:
+    """The origin of the cells of a block."""
+    x, y, yaw = occupancy.origin
+    rows, columns = block
+    return x + columns.start * occupancy.resolution, y + rows.start * occupancy.resolution, yaw
+
+
+def _crop_traffic(traffic: FlowMap, region: Region) -> FlowMap:
+    block = _cells(traffic, region) or (slice(0, 0), slice(0, 0))
+    crossings, speed = traffic.crossings[block], traffic.speed[block]
+    return replace(traffic, crossings=crossings, speed=speed, origin=_corner(traffic, block))

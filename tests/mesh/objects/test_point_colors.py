@@ -13,7 +13,7 @@ from stillmap.core.camera import Images
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.texture import GRAY
-from stillmap.results.points import COLOURS, FIELDS
+from stillmap.results.point_cloud import COLOURS, FIELDS
 from stillmap.sim.camera import compute_static_color
 
 

@@ -27,8 +27,13 @@ from stillmap.io.ros.writer import (
 )
 from stillmap.results.mapped_place import MappedPlace
 from stillmap.results.objects import Mover, interpolate_pose, iter_present_tracks
-from stillmap.results.point_cloud import Block, cloud_from_recording
-from stillmap.results.points import FIELDS, PACKED_COLOUR, make_vertices
+from stillmap.results.point_cloud import (
+    FIELDS,
+    PACKED_COLOUR,
+    Block,
+    cloud_from_recording,
+    make_vertices,
+)
 
 Float = NDArray[np.float64]
 Progress = Callable[[float], None]

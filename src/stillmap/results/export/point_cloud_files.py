@@ -12,11 +12,12 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE, open_las_writer
 from stillmap.results.export import e57
-from stillmap.results.point_cloud import Block, Cloud
-from stillmap.results.points import (
+from stillmap.results.point_cloud import (
     COLOURS,
     FIELDS,
     PACKED_COLOUR,
+    Block,
+    Cloud,
     Fields,
     cloud_fields,
     make_vertices,

@@ -18,11 +18,10 @@ from stillmap.results.colors import (
     color_by_p_static,
     color_static,
 )
-from stillmap.results.viewer.beams import Beams
 from stillmap.results.viewer.measuring import Ray, pick_plane, pick_point
 from stillmap.results.viewer.nodes import NO_SHADOWS, Nodes, node_path
 from stillmap.results.viewer.objects import ObjectNodes
-from stillmap.results.viewer.scene import MAX_POINTS, MapImage, Points, to_rgba
+from stillmap.results.viewer.scene import MAX_POINTS, Beams, MapImage, Points, to_rgba
 from stillmap.results.viewer.sessions import Sessions
 
 _MAX_TRAJECTORY_POINTS = 5_000

@@ -10,18 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
+from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
+from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
 from stillmap.results.objects import interpolate_pose
 from stillmap.results.point_cloud import Part, cloud_from_folder
 from stillmap.results.reader import SESSIONS, Grid, Track, is_place, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
-from stillmap.results.report.place_pictures import PlacePictures
+from stillmap.results.report.place import PlacePictures
 from stillmap.results.timeline import Timeline, read_timeline
+from stillmap.slam.deskew import deskew_recording
+from stillmap.slam.options import SlamOptions
 
 Float = NDArray[np.float64]
 MAX_POINTS: dict[Part, int] = {"static": 500_000, "dynamic": 200_000}
@@ -32,6 +37,11 @@ _MAX_COORDINATE = 8_000.0  # m; beyond it float32 loses millimeters, and the ori
 _GROUND_QUANTILE = 0.05  # of the heights near the trajectory
 _GROUND_RADIUS = 15.0  # m around the trajectory
 _MIN_IMAGE_SIZE = 2_000  # pixels; browsers blur smaller images
+MAX_BEAMS = 60_000  # shown of a scan
+_BLOCK_SCANS = 256  # deskewed at once
+_MAX_READ = 20_000_000  # beams read to find the dynamic ones, which takes seconds
+# scans before and after one from which it is deskewed; in 2D several lasers may take turns
+_NEIGHBORS = {2: 8, 3: 1}
 Value = TypeVar("Value")
 
 
@@ -236,3 +246,71 @@ def _read_or_note(notes: list[str], read: Callable[..., Value], *arguments: obje
     except InputError as error:
         notes.append(str(error))
         return None
+
+
+class ScanView(NamedTuple):
+    """Returns of one scan.
+
+    Attributes:
+        ends: (n, 3) m in the map frame; z = 0 in 2D.
+        p_static: (n,) float32.
+        origin: (3,) m, position of the sensor.
+    """
+
+    ends: NDArray[np.float64]
+    p_static: NDArray[np.float32]
+    origin: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """The recording of a result with labels and poses.
+
+    Attributes:
+        recording: T scans, M beams; may be memory-mapped.
+        p_static: (M,) float32, P(c = 1), NaN for unusable beams.
+        poses: (T, D+1, D+1) T_map_base.
+        slam: options of deskewing.
+    """
+
+    recording: Recording
+    p_static: NDArray[np.float32]
+    poses: NDArray[np.float64]
+    slam: SlamOptions
+
+    def scan_view(self, scan: int, max_count: int = MAX_BEAMS) -> ScanView:
+        """At most `max_count` returns of a scan; reads only this scan and its neighbors."""
+        D, T = self.recording.dimension, self.recording.n_scans
+        first, end = max(scan - _NEIGHBORS[D], 0), min(scan + _NEIGHBORS[D] + 1, T)
+        near = deskew_recording(
+            self.recording.slice_scans(first, end), self.poses[first:end], self.slam
+        )
+        beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
+        use = np.flatnonzero(near.hit[at])
+        use = use[sample_indices(len(use), max_count)]
+        T_map_sensor = near.T_map_sensor(self.poses[first:end])[scan - first]
+        ends, origin = np.zeros((len(use), 3)), np.zeros(3)
+        points = near.points[at][use].astype(np.float64)
+        ends[:, :D] = points @ T_map_sensor[:D, :D].T + T_map_sensor[:D, D]
+        origin[:D] = T_map_sensor[:D, D]
+        p_static = np.asarray(self.p_static[beams][use])
+        self.recording.release_pages(self.p_static)
+        return ScanView(ends, p_static, origin)
+
+    def dynamic_ends(self, max_count: int) -> Float:
+        """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns.
+
+        The recording is read in blocks of scans; of a long one not every block.
+        """
+        offset, T = self.recording.offset, self.recording.n_scans
+        blocks = np.arange(0, T, _BLOCK_SCANS)
+        most = max(1, _MAX_READ * len(blocks) // max(self.recording.n_beams, 1))
+        parts = [np.zeros((0, self.recording.dimension))]
+        for first in blocks[sample_indices(len(blocks), most)].tolist():
+            end = min(first + _BLOCK_SCANS, T)
+            poses, p_static = self.poses[first:end], self.p_static[offset[first] : offset[end]]
+            block = deskew_recording(self.recording.slice_scans(first, end), poses, self.slam)
+            parts.append(sample_dynamic_points(block, poses, p_static, len(p_static)))
+            self.recording.release_pages(self.p_static)
+        ends = np.concatenate(parts)
+        return ends[sample_indices(len(ends), max_count)]

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.results.viewer.beams import Beams
 from stillmap.results.viewer.layers import Layers
 from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS, help_html, legend_html
 from stillmap.results.viewer.measuring import Measuring
@@ -21,7 +20,7 @@ from stillmap.results.viewer.nodes import (
     table_html,
 )
 from stillmap.results.viewer.objects import ObjectNodes, describe_object
-from stillmap.results.viewer.scene import Scene
+from stillmap.results.viewer.scene import Beams, Scene
 from stillmap.results.viewer.server import start_server, stop_server
 from stillmap.results.viewer.sessions import Sessions
 
