@@ -5,7 +5,7 @@ import pytest
 
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
-from stillmap.results.viewer import beams as viewer_beams
+from stillmap.results.viewer import scene as viewer_scene
 from stillmap.results.viewer.scene import Beams
 from stillmap.slam import SlamOptions, deskew_recording
 
@@ -53,8 +53,8 @@ def test_dynamic_ends(beams):
 
 def test_of_a_long_recording_not_every_block_is_read(beams, monkeypatch):
     """Showing hours does not take as long as mapping them."""
-    monkeypatch.setattr(viewer_beams, "_BLOCK_SCANS", 1)
-    monkeypatch.setattr(viewer_beams, "_MAX_READ", beams.recording.n_beams // 2)
+    monkeypatch.setattr(viewer_scene, "_BLOCK_SCANS", 1)
+    monkeypatch.setattr(viewer_scene, "_MAX_READ", beams.recording.n_beams // 2)
     views = [beams.scan_view(scan) for scan in range(beams.recording.n_scans)]
     counts = [int((view.p_static < 0.5).sum()) for view in views]
     assert 0 < len(beams.dynamic_ends(10_000)) < sum(counts)
