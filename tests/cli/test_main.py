@@ -28,11 +28,10 @@ def test_version(stillmap):
         (("map", "log", "-o", "out", "--estimator", "guess"), "'guess'"),
         (("info", "--frobnicate", "x"), "--frobnicate"),
         (("eval",), "eval"),
+        ((), "COMMAND"),
     ],
 )
 def test_bad_call_is_one_line(words, said, capsys):
-    from stillmap.cli.main import main
-
     with pytest.raises(SystemExit) as left:
         main(list(words))
     out, err = capsys.readouterr()

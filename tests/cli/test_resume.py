@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from result_contents import contents
 
+from stillmap.cli.main import main
 from stillmap.core import array_folder
 from stillmap.pipeline import result
 from stillmap.pipeline.em_loop import iterate
@@ -27,11 +28,10 @@ ALL = 4  # iterations
 
 
 @pytest.fixture(scope="module")
-def whole(stillmap, room, tmp_path_factory) -> Path:
+def whole(room, tmp_path_factory) -> Path:
     """What a run writes that nobody interrupts."""
     out = tmp_path_factory.mktemp("whole") / "out"
-    done = stillmap("map", room, "-o", out, *WORDS)
-    assert done.returncode == 0, done.stderr
+    assert main(["map", str(room), "-o", str(out), "--quiet", *WORDS]) == 0
     assert os.listdir(out.parent) == ["out"]
     assert len(json.loads((out / "run.json").read_text())["iterations"]) == ALL
     return out

@@ -26,15 +26,6 @@ def report(tmp_path):
     return out
 
 
-@pytest.fixture(scope="module")
-def mapped(stillmap, room, tmp_path_factory):
-    """The result of mapping the room."""
-    out = tmp_path_factory.mktemp("viewed") / "out"
-    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=1", "--quiet")
-    assert done.returncode == 0, done.stderr
-    return out
-
-
 @pytest.fixture
 def elsewhere(monkeypatch):
     """No screen, no browser."""

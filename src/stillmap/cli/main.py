@@ -16,7 +16,7 @@ from stillmap.cli.console import (
     say,
     write_line,
 )
-from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
+from stillmap.cli.parser import EXIT_INPUT, parser
 from stillmap.core.errors import (
     InputError,
     is_out_of_memory,
@@ -70,13 +70,8 @@ def _report_failure(error: Exception) -> int:
 
 def _parse(words: list[str]) -> argparse.Namespace:
     command = next((word for word in words if not word.startswith("-")), "")
-    top = parser([command])
-    args = top.parse_args(words)
+    args = parser([command]).parse_args(words)
     args.words = words
-    if args.command is None:
-        listed = "".join(f"  {name:<12} {about}\n" for name, about in COMMANDS.items())
-        usage = f"{top.format_usage()}\ncommands:\n{listed}\nsee stillmap --help\n"
-        top.exit(EXIT_INPUT, usage)
     return args
 
 

@@ -93,20 +93,16 @@ def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") 
     """Say after a failure or an interruption how to go on, where there is something to go on."""
     try:
         yield
-    except (KeyboardInterrupt, SystemExit):
-        if not args.quiet:
-            say(_describe_continuation(args.words, checkpoints))
-        raise
-    except Exception as error:
+    except BaseException as error:
         failure = memory_error(error) if is_out_of_memory(error) else error
-        if not checkpoints.is_in_use:
-            raise
         continuation = _describe_continuation(args.words, checkpoints)
-        if not isinstance(failure, InputError):
+        if isinstance(failure, InputError) and checkpoints.is_in_use:
+            hint = "; ".join(filter(None, (failure.hint, continuation)))
+            raise InputError(failure.what, where=failure.where, hint=hint) from error
+        is_interrupt = isinstance(error, KeyboardInterrupt | SystemExit)
+        if not args.quiet if is_interrupt else checkpoints.is_in_use:
             say(continuation)
-            raise
-        hint = "; ".join(filter(None, (failure.hint, continuation)))
-        raise InputError(failure.what, where=failure.where, hint=hint) from error
+        raise
 
 
 def _describe_continuation(words: list[str], checkpoints: "CheckpointFolder") -> str:

@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
+from itertools import takewhile
 from typing import Any, NoReturn
 
 from stillmap.cli.arguments import add_flags
@@ -37,8 +38,8 @@ class Parser(argparse.ArgumentParser):
         # an empty path is the working directory, which --overwrite would replace
         if any(re.fullmatch(r"(--[^=]+=)?", word) for word in words):
             self.error("an argument is empty", "a variable that is not set?")
-        if self.subcommands() is None:
-            self._reject([word for word in _flags(words) if not self._knows(word)])
+        own = takewhile(lambda word: word.startswith("-"), words) if self.subcommands() else words
+        self._reject([word for word in _flags(list(own)) if not self._knows(word)])
         found, unknown = super().parse_known_args(words, namespace)
         self._reject(unknown)
         return found, unknown
@@ -125,7 +126,7 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     top.set_defaults(verbose=False, quiet=False)
-    commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, about in COMMANDS.items():
         if name in wanted:
             module = import_module(f"stillmap.cli.{name}")
