@@ -16,7 +16,7 @@ from stillmap.live.replay import iter_beams
 from stillmap.live.sweep_view import _trace_low
 from stillmap.sim import scene_by_name, simulate
 
-LIDAR = {"channels": 16, "columns": 360}
+LIDAR = {"channels": 16, "columns": 240}
 FIRST = 60  # sweep at which the robot is switched on
 
 
