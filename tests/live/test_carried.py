@@ -39,28 +39,19 @@ def errors(poses, true):
     return np.hypot(*(T @ true - poses)[:, :2, 2].T)
 
 
-def test_no_scan_is_silently_wrong(answers):
-    updates, _, true = answers
+def test_it_is_found_in_its_own_map(answers):
+    updates, poses, true = answers
+    doubts = [update.doubts for update in updates]
     off = errors(np.array([update.pose for update in updates]), true)
     assert off[BEFORE] > 5.0
-    assert all(update.doubts for update, far in zip(updates, off, strict=True) if far > 0.3)
-    assert not any("contradicted" in update.doubts for update in updates[:BEFORE])
-
-
-def test_it_is_found_in_its_own_map(answers):
-    updates, _, true = answers
-    assert any("carried" in update.doubts for update in updates[BEFORE:])
-    assert not updates[-1].doubts
-    off = errors(np.array([update.pose for update in updates]), true)
+    assert all(one for one, far in zip(doubts, off, strict=True) if far > 0.3)
+    assert not any("contradicted" in one for one in doubts[:BEFORE])
+    carried = next(k for k in range(BEFORE, len(doubts)) if "carried" in doubts[k])
+    assert any("lost" in one for one in doubts[carried + 1 :])
+    assert not doubts[-1]
     assert off[-10:].max() < 0.1
-
-
-def test_the_poses_of_the_scans_until_then_are_known_in_hindsight(answers):
-    updates, poses, true = answers
+    # in hindsight
     off = errors(poses, true)
     assert off[: BEFORE - 5].max() < 0.1  # the last ones may have fit by chance
-    off = off[BEFORE:]
-    carried = next(k for k, one in enumerate(updates[BEFORE:]) if "carried" in one.doubts)
-    assert np.isnan(off[:carried]).all()  # they fit neither here nor there
-    assert any("lost" in one.doubts for one in updates[BEFORE + carried + 1 :])
+    assert np.isnan(off[BEFORE:carried]).all()  # they fit neither here nor there
     assert off[carried:].max() < 0.1

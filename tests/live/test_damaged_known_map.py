@@ -6,7 +6,6 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
-from stillmap.results.reader import read_grid
 
 VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "p_static")])
 
@@ -54,6 +53,9 @@ def test_it_is_a_known_map(place):
     np.save(place / "live/known_route.npy", np.eye(4)[None])
     kept = open_cloud(place)
     assert kept.cloud.route.shape == (3, 4, 4)
+    p_occupied = KnownMap(place).in_map_frame.p_occupied
+    put_map(place, p_occupied=p_occupied.astype(np.longdouble))
+    np.testing.assert_array_equal(KnownMap(place).in_map_frame.p_occupied, p_occupied)
     assert kept.cloud.stands.any()
 
 
@@ -71,14 +73,6 @@ def test_layers_of_the_map(place, name, layer):
     put_map(place, **{name: layer})
     with pytest.raises(InputError, match=rf"map\.npz: {name} is"):
         KnownMap(place).make_grid()
-
-
-@pytest.mark.parametrize("kind", [np.float16, np.float64, np.longdouble])
-def test_probabilities_of_other_precision_are_read(place, kind):
-    put_map(place, p_occupied=read_grid(place).p_occupied.astype(kind))
-    grid = read_grid(place)
-    assert grid.p_occupied.dtype == np.float32
-    assert grid.occupied.sum() == 156
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -41,19 +40,15 @@ def server():
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory):
     folder = tmp_path_factory.mktemp("foxglove") / "hall"
-    write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 150}}), 1), folder)
+    write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 80}}), 1), folder)
     return folder
 
 
-def show(server, run, scans, mapper=None, pause=0.0):
-    """Show some scans of a run as if they were answered now; seconds of each call."""
-    seconds = []
+def show(server, run, scans, pause=0.0):
+    """Show some scans of a run as if they were answered now."""
     for k in scans:
-        begin = time.perf_counter()
-        server.show(mapper or run.mapper, run.beams[k], run.updates[k])
-        seconds.append(time.perf_counter() - begin)
+        server.show(run.mapper, run.beams[k], run.updates[k])
         time.sleep(pause)
-    return np.array(seconds)
 
 
 def wait_until_subscribed(server, run, client, topics):
@@ -155,34 +150,6 @@ def test_who_comes_late_sees_the_map_with_the_next_scan(server, corridor):
             assert client.received["/doubts"][-1]["message"] == "no doubts"
 
 
-def test_a_client_that_reads_nothing_delays_nobody(server, corridor):
-    stuck = socket.create_connection(("127.0.0.1", int(server.url.rpartition(":")[2])))
-    stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
-    shake_hands_and_subscribe(stuck)
-    with Client(server.url) as client:
-        client.subscribe("/pose")
-        wait_until_subscribed(server, corridor, client, ["/pose"])
-        seconds = np.concatenate([show(server, corridor, range(300)) for _ in range(10)])
-        assert np.median(seconds) < 5e-3
-        show(server, corridor, [399])
-        client.wait(last_pose_is(corridor, 399))
-    stuck.close()
-
-
-def shake_hands_and_subscribe(connection):
-    """To all channels, by hand: no library reads what comes."""
-    connection.sendall(
-        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
-        b"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
-    )
-    assert connection.recv(12).endswith(b"101")
-    wanted = [{"id": k, "channelId": k} for k in range(1, 30)]
-    text = json.dumps({"op": "subscribe", "subscriptions": wanted}).encode()
-    head = bytes([0x81, 0x80 | 126]) + len(text).to_bytes(2, "big")
-    connection.sendall(head + bytes(4) + text)  # masked with zeros
-
-
 def test_several_lasers_have_topics_of_their_own(server, corridor):
     beams, update = corridor.beams[0], corridor.updates[0]
     for sensor in ("/front/scan", 2):
@@ -238,10 +205,6 @@ def test_large_maps_are_shown_in_larger_cells(monkeypatch):
     assert edge == pytest.approx(0.3)
     assert percent.size <= 20_000
     assert (percent[1, 1], percent[0, 0], percent[106, 106], percent[50, 50]) == (100, 0, 30, 255)
-    at = {field["name"]: field.get("offset", 0) for field in message["fields"]}
-    rows = np.frombuffer(message["data"], np.uint8).reshape(*percent.shape, -1)
-    assert rows[[1, 0, 50], [1, 0, 50], at["alpha"]].tolist() == [255, 255, 0]
-    assert rows[1, 1, at["red"]] < 50 < 200 < rows[0, 0, at["red"]]
 
 
 def test_movers_have_arrows_as_long_as_their_way():
@@ -257,30 +220,22 @@ def test_movers_have_arrows_as_long_as_their_way():
     assert entity["id"] == "7"
 
 
-def test_a_port_that_is_taken_is_said_in_one_line(server, hall, tmp_path, capsys):
-    port = server.url.rpartition(":")[2]
-    words = ["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--foxglove"]
-    assert main([*words, "--port", port]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert f"127.0.0.1:{port}" in said
-    assert "in use" in said
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
+        (["--foxglove", "--port", "TAKEN"], "in use"),
         (["--foxglove", "--port", "70000"], "port is from 0"),
         (["--foxglove", "--port", "0", "--host", "192.0.2.1"], "192.0.2.1"),
         (["--port", "8765"], "--foxglove"),
     ],
 )
-def test_calls_that_make_no_sense(hall, tmp_path, capsys, words, expected):
+def test_calls_that_make_no_sense(server, hall, tmp_path, capsys, words, expected):
+    words = [server.url.rpartition(":")[2] if word == "TAKEN" else word for word in words]
     assert main(["live", "--replay", str(hall), "-o", str(tmp_path / "out"), *words]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert expected in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_result_is_the_same_as_without(hall, tmp_path, capsys):
@@ -314,6 +269,6 @@ def test_ctrl_c_ends_it_with_a_whole_result(hall, tmp_path):
     assert process.returncode == 0, said
     assert "Traceback" not in said
     n = len((tmp_path / "out/trajectory.tum").read_text().splitlines())
-    assert 3 <= n < 150
+    assert 3 <= n < 80
     assert len((tmp_path / "out/live/trajectory.tum").read_text().splitlines()) == n
     assert json.loads((tmp_path / "out/run.json").read_text())

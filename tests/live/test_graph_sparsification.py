@@ -1,7 +1,5 @@
 """Where a robot drives the same way again and again, its pose graph stays as large as the area."""
 
-import itertools
-
 import numpy as np
 import pytest
 from recordings import of_one_sensor
@@ -148,47 +146,25 @@ class _Room:
         return np.where((t > 0) & (u >= -1e-9) & (u <= 1 + 1e-9), t, np.inf).min(axis=1)
 
 
-@pytest.fixture
-def closers(monkeypatch):
-    """Made closers, which are stopped after the test, for many laps of a drifting robot."""
-    made = []
-
-    def close_laps(laps, least, noise):
-        monkeypatch.setattr(loop_closer, "_MIN_SCANS", least)
-        monkeypatch.setattr(graph_sparsification, "_LATEST", 1)
-        closer, room = LoopCloser(SlamOptions()), _Room()
-        made.append(closer)
-        rng, truth, T, reported = np.random.default_rng(2), drive(laps), np.eye(3), []
-        for k, at in enumerate(truth):
-            step = se2.matrix(*rng.normal(0.0, noise * np.array([2.0, 2.0, 1.0])))
-            T = T if k == 0 else T @ se2.inverse(truth[k - 1]) @ at @ step
-            beams = to_beams(stillmap.Scan(k * 10**9, room.look(at), ANGLES))
-            scan = MappedScan(beams, np.ones(len(ANGLES), np.float32), T, 0.5 * k)
-            closer.add(scan, 1.0, np.zeros((3, 3)))
-            reported.append(closer.poll())
-        return closer, truth, [one for one in reported if one is not None]
-
-    yield close_laps
-    for closer in made:
-        closer.stop()
-
-
 @pytest.mark.slow
-def test_poses_stay_right_while_scans_leave_the_graph(closers):
-    closer, truth, _ = closers(8, 4 * LAP, 0.003)
+def test_poses_stay_right_while_scans_leave_the_graph(monkeypatch):
+    """Many laps of a drifting robot."""
+    monkeypatch.setattr(loop_closer, "_MIN_SCANS", 4 * LAP)
+    monkeypatch.setattr(graph_sparsification, "_LATEST", 1)
+    closer, room, truth = LoopCloser(SlamOptions()), _Room(), drive(8)
+    rng, T = np.random.default_rng(2), np.eye(3)
+    for k, at in enumerate(truth):
+        step = se2.matrix(*rng.normal(0.0, [0.006, 0.006, 0.003]))
+        T = T if k == 0 else T @ se2.inverse(truth[k - 1]) @ at @ step
+        beams = to_beams(stillmap.Scan(k * 10**9, room.look(at), ANGLES))
+        scan = MappedScan(beams, np.ones(len(ANGLES), np.float32), T, 0.5 * k)
+        closer.add(scan, 1.0, np.zeros((3, 3)))
+        closer.poll()
+    closer.stop()
     assert len(closer._scans) < 6 * LAP
     assert len(closer._state.poses) == len(closer._centers) <= len(closer._keyframes)
     every = closer._anchored.place(closer._poses)
     found = np.hypot(*(every[:, :2, 2] - truth[: len(every), :2, 2]).T)
     assert len(every) >= len(truth) - 8
     assert np.sqrt(np.mean(found**2)) < 0.1
-    drift = np.hypot(*(closer._last.T_map_base[:2, 2] - truth[-1, :2, 2]))
-    assert drift > 0.3  # of what was added
-
-
-@pytest.mark.slow
-def test_small_corrections_are_reported_every_25_metres(closers):
-    _, truth, reported = closers(4, 10**6, 0.0002)
-    counts = [len(one.poses) for one in reported]
-    assert 3 <= len(reported) < 0.2 * 0.5 * len(truth) / loop_closer._EVERY
-    assert all(b > a for a, b in itertools.pairwise(counts))
+    assert np.hypot(*(T[:2, 2] - truth[-1, :2, 2])) > 0.3  # the drift of what was added

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from live_runs import answers, poses_of
 
 from stillmap.core import se2
 from stillmap.live.scan_odometry import WallDirections, correct_heading
-from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.heading_alignment import HeadingOffset
 from stillmap.slam.scan_hits import Scan
 
@@ -55,23 +53,3 @@ def test_a_heading_takes_the_position_along():
     covariance = np.array([[0.04, 0.0, 0.01], [0.0, 0.04, 0.0], [0.01, 0.0, 0.01]])
     T = correct_heading(np.eye(3), covariance, HeadingOffset(0.1, 0.01))
     np.testing.assert_allclose(se2.parameters(T), [0.05, 0.0, 0.05], atol=1e-12)
-
-
-def drift(simulation):
-    """RMS m that poses are off as they were given, from the first one."""
-    truth = simulation.truth.T_world_base
-    off = (poses_of(answers(simulation.recording)) - se2.inverse(truth[0]) @ truth)[:, :2, 2]
-    return float(np.sqrt(np.square(off).sum(axis=1).mean()))
-
-
-@pytest.mark.slow
-def test_live_poses_drift_less(monkeypatch):
-    changes = {
-        "laser": {"beams": 180, "fov": np.pi},
-        "robot": {"scan_rate": 1.5, "scans": 400},
-    }
-    simulation = simulate(scene_by_name("corridor", changes), 2)
-    found = drift(simulation)
-    monkeypatch.setattr(WallDirections, "measure", lambda *_: None)
-    assert found < 0.035
-    assert found < 0.5 * drift(simulation)

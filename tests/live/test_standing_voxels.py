@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.live.known_cloud import _share_evidence, _sum_around
+from stillmap.live.known_cloud import _share_evidence
 
 P_UNSEEN, P_MISSED, P_HIT = 0.967, 0.003, 0.9999
 
@@ -15,14 +15,6 @@ def wall_of(rows, columns, y):
 def in_order(cells, p_occupied):
     order = np.lexsort(cells.T[::-1])
     return np.ascontiguousarray(cells[order]), p_occupied[order]
-
-
-def test_sums_are_those_of_a_slow_count():
-    rng = np.random.default_rng(0)
-    cells = np.unique(rng.integers(-4, 4, (200, 3)), axis=0)
-    values = rng.normal(size=len(cells))
-    slow = [values[(np.abs(cells - cell).max(axis=1) <= 1)].sum() for cell in cells]
-    np.testing.assert_allclose(_sum_around(cells, values), slow, atol=1e-12)
 
 
 def test_what_no_ring_of_the_sweeps_met_goes_with_its_thing():
@@ -44,8 +36,3 @@ def test_a_wall_behind_what_is_gone_stays_where_it_was_hit():
     assert stands[is_wall & (p_occupied == P_HIT)].all()
     assert stands[is_wall & (cells[:, 0] > 6)].all()
     assert not stands[~is_wall & (p_occupied == P_MISSED)].any()
-
-
-def test_what_was_not_seen_stays_as_it_was():
-    cells, p_occupied = in_order(wall_of(4, 4, 0), np.full(16, P_UNSEEN))
-    np.testing.assert_allclose(_share_evidence(cells, p_occupied, P_UNSEEN), P_UNSEEN)

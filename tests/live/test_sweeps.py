@@ -55,15 +55,6 @@ def test_threads_change_nothing():
         run.mapper.close()
 
 
-@pytest.mark.slow
-def test_saves_what_map_writes(sweeps, tmp_path):
-    sweeps.mapper.save(tmp_path / "out")
-    result = stillmap.load(tmp_path / "out")
-    np.testing.assert_allclose(result.poses, sweeps.mapper.poses, atol=1e-6)
-    given = np.load(tmp_path / "out/live/beams/p_static.npy")
-    np.testing.assert_array_equal(given, sweeps.p_static)
-
-
 def test_labels_of_an_earlier_sweep_follow_from_what_is_known_now(sweeps):
     t = 40
     beams = sweeps.beams[t]
