@@ -240,11 +240,7 @@ class _Full:
 
 @pytest.mark.parametrize(
     ("module", "name", "after"),
-    [
-        (array_folder, "write_npy", 1),
-        (array_folder, "write_npy", 8),
-        (finish, "write_map_npz", 0),
-    ],
+    [(array_folder, "write_npy", 1), (array_folder, "write_npy", 8), (finish, "write_map_npz", 0)],
 )
 def test_a_full_disk(flat_place, flat_days, tmp_path, monkeypatch, module, name, after) -> None:
     out = tmp_path / "out"

@@ -27,10 +27,7 @@ def test_events_beside_a_change_share_a_part_of_its_time():
     came = np.ones(1, bool)
     group = changes._Events(np.array([0]), came, np.array([0]), np.array([5]))
     beside = changes._Events(
-        np.array([1, 2, 3, 4]),
-        np.ones(4, bool),
-        np.array([0, 3, 3, 4]),
-        np.array([2, 5, 4, 5]),
+        np.array([1, 2, 3, 4]), np.ones(4, bool), np.array([0, 3, 3, 4]), np.array([2, 5, 4, 5])
     )
     found = changes._attach(group, beside, place)
     assert found.before.max() < found.after.min()

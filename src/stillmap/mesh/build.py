@@ -22,12 +22,7 @@ from stillmap.mesh.texture import TexturedMesh, bake_texture
 from stillmap.mesh.triangle_mesh import Mesh, Tell
 from stillmap.mesh.tsdf import build_surface
 from stillmap.mesh.view_selection import read_with_gains
-from stillmap.mesh.views import (
-    UNREADABLE,
-    View,
-    filter_readable,
-    find_views,
-)
+from stillmap.mesh.views import UNREADABLE, View, filter_readable, find_views
 
 Bake = Callable[[Mesh, Int32, list[View]], TexturedMesh]
 

@@ -14,13 +14,7 @@ from stillmap.core.recording import Recording, max_scan_duration_ns
 from stillmap.em import GroundMap
 from stillmap.mesh.range_image import has_planar_scans
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import (
-    HOLD,
-    MAX_OBJECT_HEIGHT,
-    MIN_VEHICLE_LENGTH,
-    Box,
-    fit_box,
-)
+from stillmap.tracking.boxes import HOLD, MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box, fit_box
 
 OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
 _OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin

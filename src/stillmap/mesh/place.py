@@ -66,19 +66,12 @@ class ViewAssignment(ShortRepr):
     def select(self, kept: Bool) -> "ViewAssignment":
         """That of the faces marked in `kept` (F,)."""
         return ViewAssignment(
-            self.mesh.select(kept),
-            self.view[kept],
-            self.p_static[kept],
-            self.visible[kept],
+            self.mesh.select(kept), self.view[kept], self.p_static[kept], self.visible[kept]
         )
 
 
 def assign_views(
-    mesh: Mesh,
-    views: Sequence[View],
-    inputs: MeshInputs,
-    threads: int = 1,
-    tell: Tell = no_tell,
+    mesh: Mesh, views: Sequence[View], inputs: MeshInputs, threads: int = 1, tell: Tell = no_tell
 ) -> tuple[ViewAssignment, Float]:
     """Chooses for each face the view that most likely shows static surface only (Sect. 4.4).
 

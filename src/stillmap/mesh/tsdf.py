@@ -82,10 +82,7 @@ def select_scans(T_map_sensor: Float, sensor: Int32, scene_range: float) -> Inde
 
 
 def choose_resolution(
-    recording: Recording,
-    poses: Float,
-    layout: ScanLayout,
-    voxel_size: float | None = None,
+    recording: Recording, poses: Float, layout: ScanLayout, voxel_size: float | None = None
 ) -> tuple[float, float]:
     """The edge of a voxel in metres, and the angle in rad between beams of range images.
 

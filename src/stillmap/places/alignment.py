@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.places.surface_map import CONFLICT_WEIGHT, Comparison, SurfaceMap, compare_maps
 from stillmap.slam import motion_model
 
-Float = NDArray[np.float64]
-Raster = NDArray[np.float32]
+Raster = Float32
 
 _CELL, _MAX_CELLS = 0.3, 1000  # m, and cells along an edge: larger maps get larger cells
 _TURN_CELLS = 1.7  # by which the surfaces move from one heading to the next, on average
@@ -151,7 +151,7 @@ def _spread(offset: Float) -> float:
     return float(np.sqrt(np.square(offset).sum(axis=1).mean()))
 
 
-def _find_maxima(score: Raster, most: int) -> NDArray[np.intp]:
+def _find_maxima(score: Raster, most: int) -> Index:
     """The highest positive values that none within two cells exceeds, the highest first: their
     flat indices. The raster goes on at its other side."""
     values, (X, Y) = score.ravel(), score.shape
@@ -231,8 +231,8 @@ class _Layer(NamedTuple):
     """A map: its blurred field, its lowest square, some of its surfaces, and how many each counts
     for."""
 
-    field: NDArray[np.float32]
-    low: NDArray[np.int64]
+    field: Float32
+    low: Int64
     points: Float
     weight: float
 

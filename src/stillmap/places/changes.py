@@ -7,14 +7,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.places.door_leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
 from stillmap.places.place_states import PlaceStates, are_near
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 Kind = Literal["appeared", "gone", "moved", "door"]
 
 
@@ -87,8 +86,6 @@ def change_cells(
     return {"change": number, "xyz"[:D]: centres}
 
 
-Cells = NDArray[np.int64]
-
 _MIN_PROBABILITY = 0.5  # that a cell changed
 _LINK_DISTANCE = 0.3  # m within which changed cells form one object
 # of an object away from static surface, and with what lies beside it: fewer are feet of who stood
@@ -106,7 +103,7 @@ class _Events(NamedTuple):
     """N changes of single cells: the cell, came or left, last session before and first after."""
 
     cell: Index
-    came: NDArray[np.bool_]
+    came: Bool
     before: Index
     after: Index
 
@@ -197,7 +194,7 @@ def _find_events(place: PlaceStates) -> _Events:
     changed = np.flatnonzero(states.p_changing > _MIN_PROBABILITY)
     path, observed = states.path[changed], states.observed[changed]
     S = path.shape[1]
-    columns: list[tuple[Index, NDArray[np.bool_], Index, Index]] = []
+    columns: list[tuple[Index, Bool, Index, Index]] = []
     last = np.full(len(changed), -1)  # the last session that observed each cell
     for s in range(S):
         at = np.maximum(last, 0)

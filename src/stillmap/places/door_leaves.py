@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from stillmap.core.array_types import Float
 
 # m: length of what is seen of a leaf, half its thickness with noise
 _LENGTH, _THICKNESS = (0.3, 1.6), 0.12

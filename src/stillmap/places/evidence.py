@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import arrays, se2
+from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.keyframes import Keyframes
 from stillmap.slam import PoseGraph
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +34,9 @@ class BeamCells(ShortRepr):
         resolution: m, edge of a cell.
     """
 
-    cells: NDArray[np.int32]
-    node: NDArray[np.int32]
-    of_beam: NDArray[np.int32]
+    cells: Int32
+    node: Int32
+    of_beam: Int32
     p_static: NDArray[np.float16]
     resolution: float
 
@@ -55,11 +54,7 @@ class BeamCells(ShortRepr):
 
 
 def find_beam_cells(
-    deskewed: Recording,
-    poses: Float,
-    p_static: NDArray[np.float32],
-    graph: PoseGraph,
-    resolution: float,
+    deskewed: Recording, poses: Float, p_static: Float32, graph: PoseGraph, resolution: float
 ) -> BeamCells:
     """The cells in which the beams of a session ended.
 
@@ -91,7 +86,7 @@ def find_beam_cells(
 
 def _iter_end_cells(
     recording: Recording, poses: Float, resolution: float
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.int32]]]:
+) -> Iterator[tuple[Index, Int32]]:
     """Beams (n,) that hit, and the cells (n, D) in which they ended, block by block."""
     for block in arrays.iter_blocks(recording.hit):
         beams = block.start + np.flatnonzero(recording.hit[block])
@@ -99,7 +94,7 @@ def _iter_end_cells(
         yield beams, np.floor(ends / resolution).astype(np.int32)
 
 
-def cell_keys(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+def cell_keys(cells: NDArray[np.integer]) -> Int64:
     """(N,) keys of cells (N, D), which sort as the cells do, column by column."""
     bits = 63 // cells.shape[1]
     key = np.zeros(len(cells), np.int64)
@@ -128,7 +123,7 @@ class Evidence(ShortRepr):
         resolution: m, edge of a cell.
     """
 
-    corner: NDArray[np.int32]
+    corner: Int32
     hits: Bytes
     passes: Bytes
     resolution: float
@@ -143,7 +138,7 @@ class Evidence(ShortRepr):
         """Cells along the edge of a block."""
         return BLOCK[self.dimension]
 
-    def crop(self, low: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[Bytes, Bytes]:
+    def crop(self, low: Int64, shape: tuple[int, ...]) -> tuple[Bytes, Bytes]:
         """Hits and passes, in units of 1 / UNITS, in a box of cells from `low` (D,) on; 0 where
         nothing was observed."""
         edge = self.edge
@@ -165,7 +160,7 @@ class Evidence(ShortRepr):
 
 
 def crop_without_gaps(
-    evidence: Evidence, low: NDArray[np.int64], shape: tuple[int, ...]
+    evidence: Evidence, low: Int64, shape: tuple[int, ...]
 ) -> tuple[Bytes, Bytes]:
     """`Evidence.crop`, in 3D without the gaps between the channels of a lidar.
 
@@ -220,7 +215,7 @@ def _export(grid: em.Grid, D: int, resolution: float) -> Evidence:
     )
 
 
-def to_sums(units: NDArray[np.unsignedinteger]) -> NDArray[np.float32]:
+def to_sums(units: NDArray[np.unsignedinteger]) -> Float32:
     """Hits or passes of what `Evidence.crop` counts."""
     return units.astype(np.float32) / np.float32(UNITS)
 

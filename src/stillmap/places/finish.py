@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.array_types import Float32
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
@@ -22,12 +22,7 @@ from stillmap.em import OccupancyMap
 from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
-from stillmap.places.changes import (
-    PlaceChange,
-    change_cells,
-    change_records,
-    detect_place_changes,
-)
+from stillmap.places.changes import PlaceChange, change_cells, change_records, detect_place_changes
 from stillmap.places.grow import estimate_planar
 from stillmap.places.keyframes import join_keyframes
 from stillmap.places.objects import write_objects
@@ -55,8 +50,6 @@ from stillmap.results.report.place import render_place_report
 from stillmap.results.run_json import quality_record
 from stillmap.results.timeline import CHANGES, STATES, PlaceSession
 from stillmap.slam import PoseGraph
-
-Float = NDArray[np.float64]
 
 LAST, MAJORITY = "last", "majority"
 _STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
@@ -192,11 +185,7 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
 
 
 def place_record(
-    folder: Path,
-    result: PlaceResult,
-    options: Options,
-    map_state: str,
-    occupancy: OccupancyMap,
+    folder: Path, result: PlaceResult, options: Options, map_state: str, occupancy: OccupancyMap
 ) -> dict[str, Any]:
     """The content of `run.json` of a place; `occupancy` is its map in its local frame."""
     place, labels = result.place, read_labels(folder)
@@ -245,7 +234,7 @@ def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, tim
     write_placement(home, placed)
 
 
-def _label_keyframes(placed: PlacedSession, shown: ShownState) -> NDArray[np.float32]:
+def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
     """(M,) P(static) of the beams of a session's keyframes, as the map shows the place."""
     keyframes = placed.session.keyframes
     beams = np.flatnonzero(keyframes.recording.hit)

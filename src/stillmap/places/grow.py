@@ -8,19 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places import matching
 from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.matching import KeyframeMatch, Verdict
 from stillmap.places.place import Place, PlacedSession, Tie, optimize_nodes, update_evidence
-from stillmap.places.place_states import (
-    PlaceStates,
-    estimate_place,
-    measure_overlap,
-)
+from stillmap.places.place_states import PlaceStates, estimate_place, measure_overlap
 from stillmap.places.placement import (
     CORRECTED_STD,
     PREDICTION_STD,
@@ -30,8 +26,6 @@ from stillmap.places.placement import (
     select_references,
 )
 from stillmap.places.surface_map import compare_maps, make_surface_map
-
-Float = NDArray[np.float64]
 
 _MIN_NODES, _MIN_SPREAD = 8, 5.0  # nodes, and their spread in m, from which on tilt is estimated
 _MAX_TILT = 0.1  # rad

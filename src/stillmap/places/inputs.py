@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import se2
 from stillmap.core.array_folder import write_arrays
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.json import write_json
 from stillmap.core.local_frame import LocalFrame
@@ -27,30 +27,16 @@ from stillmap.pipeline.options import Options
 from stillmap.places.evidence import find_beam_cells
 from stillmap.places.keyframes import Keyframes, Session, select_keyframes
 from stillmap.places.objects import copy_objects
-from stillmap.places.store import (
-    MAX_DISTANCE,
-    SESSION_ORIGIN,
-    STATE,
-    read_session,
-    write_session,
-)
+from stillmap.places.store import MAX_DISTANCE, SESSION_ORIGIN, STATE, read_session, write_session
 from stillmap.results.folder import open_result
 from stillmap.results.mapped_place import input_stem
 from stillmap.results.pose_graph_g2o import read_g2o
-from stillmap.results.reader import (
-    LOCAL_ORIGIN,
-    RECORD,
-    TILTING,
-    is_place,
-    is_result,
-    read_run,
-)
+from stillmap.results.reader import LOCAL_ORIGIN, RECORD, TILTING, is_place, is_result, read_run
 from stillmap.results.result import Result, build, load
 from stillmap.slam import PoseGraph, deskew_recording, local_map
 from stillmap.slam.local_map import KEYFRAME_ANGLE
 from stillmap.slam.pose_graph import Constraint
 
-Float = NDArray[np.float64]
 Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | Result
 
 _VOXEL_SIZE = 0.15  # m, of the evidence of 3D sessions, unless the options say another
@@ -272,7 +258,7 @@ def make_session(
     name: str,
     deskewed: Recording,
     poses: Float,
-    p_static: NDArray[np.float32],
+    p_static: Float32,
     graph: PoseGraph | None,
     band: tuple[float, float],
     threads: int = 1,

@@ -4,17 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.slam import PoseGraph
 from stillmap.slam.scan_hits import beams_of_scans, select_beams
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # between keyframes: m of travel, rad, s of standing still; in 3D sweeps see farther
 _SPACING = {2: (0.25, 0.2, 4.0), 3: (1.0, 0.5, 4.0)}
@@ -36,7 +33,7 @@ class Keyframes(ShortRepr):
     recording: Recording
     scans: Index
     poses: Float
-    e: NDArray[np.float32]
+    e: Float32
     nodes: Index
 
     @property
@@ -66,7 +63,7 @@ class Session(ShortRepr):
 
     name: str
     input: str | None
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Int64
     poses: Float
     graph: PoseGraph
     keyframes: Keyframes
@@ -86,7 +83,7 @@ class Session(ShortRepr):
 
 
 def select_keyframes(
-    deskewed: Recording, poses: Float, p_static: NDArray[np.float32], nodes: Index
+    deskewed: Recording, poses: Float, p_static: Float32, nodes: Index
 ) -> Keyframes:
     """The keyframes of a session.
 
@@ -116,7 +113,7 @@ def space_scans(recording: Recording, poses: Float) -> Index:
 
 
 def _progress(
-    stamp_ns: NDArray[np.int64], poses: Float, metres: float, radians: float, seconds: float
+    stamp_ns: Int64, poses: Float, metres: float, radians: float, seconds: float
 ) -> Float:
     """(T,) sum of travel, turn and time up to each scan, in units of the spacing."""
     steps = se2.inverse(poses[:-1]) @ poses[1:]

@@ -8,9 +8,9 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.places.keyframes import Keyframes, join_keyframes
 from stillmap.places.place import PlacedSession
 from stillmap.slam import loop_candidates, loop_verification, scan_matching
@@ -18,9 +18,6 @@ from stillmap.slam.lidar_odometry import LidarOdometry
 from stillmap.slam.local_map import travelled_distance
 from stillmap.slam.loop_closure_3d import SweepLoopCloser
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # m between a keyframe, or its view, and the one of the other session that it is matched with
 REACH, _VIEW_REACH = 6.0, 10.0

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content, read_bytes
 from stillmap.core.json import read_json
@@ -17,8 +18,6 @@ from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_traffic
 from stillmap.results.point_cloud import coordinate_fields, ply_header
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
-
-Float = NDArray[np.float64]
 
 _OBJECTS, _LIST, _ORIGINAL = "objects", "objects.json", "objects"
 _MAX_BYTES = 256 << 20

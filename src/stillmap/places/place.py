@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.evidence import Evidence, measure_evidence
@@ -15,8 +15,6 @@ from stillmap.places.keyframes import Session
 from stillmap.slam import pose_graph
 from stillmap.slam.local_map import propagate_corrections
 from stillmap.slam.pose_graph import Constraint
-
-Float = NDArray[np.float64]
 
 MAX_CHI2 = {2: 16.0, 3: 25.0}  # above it the graph rejects a constraint between sessions
 _LEVER = 2.0  # m at which an error of the heading counts like one of the position
@@ -65,7 +63,7 @@ def join_constraints(
 
 def optimize_nodes(
     sessions: Sequence[Session], start: Sequence[Float], ties: Sequence[Tie]
-) -> tuple[list[Float], NDArray[np.bool_]]:
+) -> tuple[list[Float], Bool]:
     """Poses of all nodes in the place, of least squares; the first node stays.
 
     Args:

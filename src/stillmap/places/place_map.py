@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import bound_box
@@ -21,9 +22,6 @@ from stillmap.places.place_states import MIN_HITS, PlaceStates, Tile, are_near, 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _STATIC_DISTANCE = 2.5  # cells: unlisted changes nearer to static surface are noise of poses
 _NEIGHBOUR_DISTANCE = 1.5  # cells between the end cell of a beam and the one that labels it
@@ -44,7 +42,7 @@ class ShownState(ShortRepr):
 
     place: PlaceStates
     p_shown: Float
-    support: NDArray[np.float32]
+    support: Float32
     noise: Index
 
     def find_cells(self, centres: Float) -> Index:
@@ -88,7 +86,7 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
     return ShownState(place, p_shown, support.astype(np.float32), np.concatenate([stands, gone]))
 
 
-def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
+def _last_observed(observed: Bool, limit: int) -> Index:
     """(K,) the last session up to `limit` that observed each cell, else the first one after."""
     before = observed[:, : limit + 1]
     last = limit - np.argmax(before[:, ::-1], axis=1)
@@ -110,9 +108,7 @@ def _settle_unlisted(place: PlaceStates, changes: list[PlaceChange]) -> tuple[In
     return alone[near], alone[~near]
 
 
-def label_session(
-    shown: ShownState, beams: BeamCells, centres: Float, session: int
-) -> NDArray[np.float32]:
+def label_session(shown: ShownState, beams: BeamCells, centres: Float, session: int) -> Float32:
     """(M,) P(static) of the beams of a session, by what all sessions saw.
 
     The probability that the map shows what reflected the beam: that it did not move during the
@@ -161,7 +157,7 @@ def changed_cell_table(
     }
 
 
-Image = NDArray[np.float32]
+Image = Float32
 
 # blocks of the box around the evidence: up to which it is always whole, and at most
 _LEAST_BLOCKS, _MOST_BLOCKS = 1 << 17, 1 << 21
@@ -202,9 +198,7 @@ def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> Occupancy
     return OccupancyMap(p_occupied, (x, y, 0.0), resolution, alpha, beta)
 
 
-def _split_by_tile(
-    shown: ShownState,
-) -> tuple[NDArray[np.intp], dict[tuple[int, ...], slice]]:
+def _split_by_tile(shown: ShownState) -> tuple[Index, dict[tuple[int, ...], slice]]:
     """Indices of the cells sorted by tile, and the slice of each tile."""
     tiles = shown.place.cells // TILE
     order = np.lexsort(tiles.T[::-1])
@@ -217,7 +211,7 @@ def _split_by_tile(
 
 
 def _draw_tile(
-    sessions: Sequence[Evidence], tile: Tile, shown: ShownState, cells: NDArray[np.intp]
+    sessions: Sequence[Evidence], tile: Tile, shown: ShownState, cells: Index
 ) -> tuple[Image, Image, Image]:
     """p_occupied, alpha and beta of a tile, x along the first axis."""
     from scipy import ndimage  # slow to load

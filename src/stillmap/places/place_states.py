@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import neighbor_pairs
 from stillmap.places.evidence import BLOCK, Bytes, Evidence, cell_keys, crop_without_gaps, to_sums
-
-Float = NDArray[np.float64]
 
 # nats: of a static hit within the tolerance, of a pass through all cells around; of one session at
 # most, since its beams share the session's errors
@@ -50,13 +49,11 @@ class CellStates(ShortRepr):
     p_static: Float
     p_changing: Float
     p_occupied: Float
-    path: NDArray[np.bool_]
-    observed: NDArray[np.bool_]
+    path: Bool
+    observed: Bool
 
 
-def weigh_evidence(
-    hits: NDArray[np.float32], passes: NDArray[np.float32], stopped: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def weigh_evidence(hits: Float32, passes: Float32, stopped: Float32) -> Float32:
     """Log likelihood ratio (nats) of occupied to free.
 
     Args:
@@ -88,9 +85,7 @@ def fit_weights(evidence: Float, rare: tuple[float, float, float] = _WEIGHTS) ->
     return weights
 
 
-def estimate_states(
-    evidence: Float, weights: Float, pairs: NDArray[np.intp] | None = None
-) -> CellStates:
+def estimate_states(evidence: Float, weights: Float, pairs: Index | None = None) -> CellStates:
     """States of cells over sessions.
 
     Args:
@@ -109,9 +104,7 @@ def estimate_states(
     return CellStates(posterior[:, 0], posterior[:, 2], p_occupied, path, observed)
 
 
-def _pool(
-    log: Float, path: NDArray[np.bool_], observed: NDArray[np.bool_], pairs: NDArray[np.intp]
-) -> Float:
+def _pool(log: Float, path: Bool, observed: Bool, pairs: Index) -> Float:
     """(K, 3) log likelihoods of cells together with their neighbours of the same history.
 
     The mean over the neighbours, times their number up to a limit: they share their errors.
@@ -199,7 +192,7 @@ def _smooth(evidence: Float, p: Float) -> Float:
     return out
 
 
-def _decode(evidence: Float) -> NDArray[np.bool_]:
+def _decode(evidence: Float) -> Bool:
     """(K, S) most probable path of the chain (Viterbi); True: occupied."""
     K, S = evidence.shape
     nats = np.ascontiguousarray(evidence.T)
@@ -220,8 +213,6 @@ def _decode(evidence: Float) -> NDArray[np.bool_]:
     return np.ascontiguousarray(path.T)
 
 
-Cells = NDArray[np.int64]
-
 _BLOCKS_PER_TILE = 8  # along each axis
 # cells: within so many of each other two surfaces are the same; around a cell that must be passed
 TOLERANCE, _FREE_RADIUS = 1, 1
@@ -235,7 +226,7 @@ _MAX_FIT_ROWS = 50_000  # cells that the weights are fitted to
 class Tile(NamedTuple):
     """A box of cells: its lowest cell (D,) and its shape."""
 
-    low: Cells
+    low: Int64
     shape: tuple[int, ...]
 
 
@@ -252,9 +243,9 @@ class PlaceStates(ShortRepr):
         weights: (3,) of static, free and changing cells.
     """
 
-    cells: Cells
-    evidence: NDArray[np.float32]
-    own: NDArray[np.float32]
+    cells: Int64
+    evidence: Float32
+    own: Float32
     states: CellStates
     resolution: float
     weights: Float
@@ -268,14 +259,12 @@ class PlaceStates(ShortRepr):
             return np.zeros(len(points))
         return np.where(key[at] == wanted, values[order[at]], 0.0)
 
-    def _index(self) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    def _index(self) -> tuple[Int64, Index]:
         key = cell_keys(self.cells)
         order = np.argsort(key)
         return key[order], order
 
-    def with_evidence(
-        self, evidence: NDArray[np.float32], changed: NDArray[np.intp]
-    ) -> "PlaceStates":
+    def with_evidence(self, evidence: Float32, changed: Index) -> "PlaceStates":
         """The same with other evidence (K, S) of the cells `changed` (n,)."""
         states = estimate_states(evidence[changed].astype(np.float64), self.weights)
         columns = {name: np.array(getattr(self.states, name)) for name in vars(states)}
@@ -284,7 +273,7 @@ class PlaceStates(ShortRepr):
         return replace(self, evidence=evidence, states=CellStates(**columns))
 
 
-def are_near(cells: Cells, others: Cells, distance: float) -> NDArray[np.bool_]:
+def are_near(cells: Int64, others: Int64, distance: float) -> Bool:
     """(n,) True for cells (n, D) at most so many cells away from any of the others."""
     if not len(cells) or not len(others):
         return np.zeros(len(cells), np.bool_)
@@ -338,7 +327,7 @@ def iter_tiles(sessions: Sequence[Evidence]) -> Iterator[Tile]:
         yield Tile(low, (size,) * D)
 
 
-def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDArray[np.float32]]:
+def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Int64, Float32]:
     """Candidate cells (k, D) of a tile, and the evidence (2, k, S) of every session: with the
     tolerance, and of each cell by itself."""
     D = len(tile.shape)
@@ -358,7 +347,7 @@ def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDAr
     return np.stack(at, axis=1) + tile.low, nats
 
 
-def _find_candidates(hits: Sequence[Bytes], radius: int) -> NDArray[np.bool_]:
+def _find_candidates(hits: Sequence[Bytes], radius: int) -> Bool:
     """The cells in which something stood in some session, and that are no noise of a wall."""
     out = np.zeros(hits[0].shape, np.bool_)
     for of in hits:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.alignment import Hypothesis, propose_alignments, spread_evenly
 from stillmap.places.evidence import measure_evidence
@@ -15,8 +15,6 @@ from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.matching import REACH, KeyframeMatch, Verdict, match_sessions
 from stillmap.places.place import PlacedSession, Tie
 from stillmap.places.surface_map import is_determined, make_surface_map
-
-Float = NDArray[np.float64]
 
 # sessions of the place that a new one is matched with; share of its nodes that only a further one
 # is near to: each takes as long as the first

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.array_folder import parse, read_array, read_npz, read_poses, write_arrays
+from stillmap.core.array_types import Int64
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content
@@ -28,8 +29,6 @@ from stillmap.results.folder import ResultFolder
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 from stillmap.results.reader import RECORD, SESSIONS, read_labels, read_run, read_tracks
 from stillmap.results.timeline import HINT, PlaceSession, read_sessions
-
-Float = NDArray[np.float64]
 
 STATE, TIES = "state", "ties.npz"
 # in the record of a session: of the frame that a place has it in, in the map frame of its result
@@ -181,7 +180,7 @@ def _read_placed(home: Path, record: PlaceSession, voxel_size: float) -> PlacedS
     return PlacedSession(session, nodes, covariance, record.overlap, evidence, planar, measured_at)
 
 
-def _read_beams(folder: Path) -> tuple[NDArray[np.int64], int]:
+def _read_beams(folder: Path) -> tuple[Int64, int]:
     """(T,) stamps of the scans of a session, and the number of its beams."""
     stamp_ns = np.array(read_array(folder / "stamp_ns.npy", (None,), np.int64))
     offset = np.array(read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64))
@@ -193,7 +192,7 @@ def _read_beams(folder: Path) -> tuple[NDArray[np.int64], int]:
     return stamp_ns, int(offset[-1])
 
 
-def read_session(home: Path, path: str | None, stamp_ns: NDArray[np.int64]) -> Session:
+def read_session(home: Path, path: str | None, stamp_ns: Int64) -> Session:
     """The session that `write_session` wrote; arrays are memory-mapped.
 
     Args:

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import bound_box
 from stillmap.places.evidence import UNITS, Bytes, Evidence
 from stillmap.places.place_states import iter_tiles
-
-Float = NDArray[np.float64]
 
 # blocks of the box around the evidence: up to which it is always whole, and at most
 _LEAST_BLOCKS, _MOST_BLOCKS = 1 << 15, 1 << 20
@@ -59,11 +58,11 @@ class SurfaceMap(ShortRepr):
         edge: m, of a square.
     """
 
-    surface: NDArray[np.float32]
-    low: NDArray[np.int64]
-    near: NDArray[np.bool_]
-    free: NDArray[np.bool_]
-    side: NDArray[np.float32]
+    surface: Float32
+    low: Int64
+    near: Bool
+    free: Bool
+    side: Float32
     edge: float
 
     def look_up(self, points: Float, sides: Float) -> Comparison:
@@ -81,7 +80,7 @@ class SurfaceMap(ShortRepr):
         agree = self.near[x, y] & ~is_other_face
         return Comparison(int(agree.sum()), int(self.free[x, y].sum()))
 
-    def is_near(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def is_near(self, points: NDArray[np.floating]) -> Bool:
         """(n,) whether points (n, 2) in metres lie near a surface."""
         at = self._squares_of(points)
         out = np.zeros(len(at), np.bool_)
@@ -96,7 +95,7 @@ class SurfaceMap(ShortRepr):
         x, y = self._squares_of(self.surface).T
         return np.asarray(self.side[x, y], np.float64)
 
-    def _squares_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+    def _squares_of(self, points: NDArray[np.floating]) -> Int64:
         return np.asarray(np.floor(points / self.edge).astype(np.int64) - self.low)
 
 
@@ -148,7 +147,7 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     return SurfaceMap(points.astype(np.float32), squares, near, free, side, square)
 
 
-def find_sides(passed: NDArray[np.bool_]) -> NDArray[np.float32]:
+def find_sides(passed: Bool) -> Float32:
     """(X, Y, 2) unit vectors towards the squares (X, Y) that beams passed; 0 where these lie on
     both sides."""
     from scipy import ndimage  # slow to load
@@ -196,5 +195,5 @@ def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float
     return True
 
 
-def _transform(T: Float, points: NDArray[np.float32]) -> Float:
+def _transform(T: Float, points: Float32) -> Float:
     return np.asarray(points @ T[:2, :2].T + T[:2, 2])

@@ -2,12 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.inputs import (
-    OrientedBox,
-    TrackedBox,
-    boxes_at,
-    is_in_or_behind_box,
-)
+from stillmap.mesh.inputs import OrientedBox, TrackedBox, boxes_at, is_in_or_behind_box
 from stillmap.tracking.boxes import Box
 
 

@@ -6,9 +6,7 @@ from scipy.spatial import cKDTree
 
 from stillmap.mesh import range_image, tsdf
 from stillmap.mesh.options import MeshOptions
-from stillmap.mesh.tsdf import (
-    build_surface,
-)
+from stillmap.mesh.tsdf import build_surface
 
 OPTIONS = MeshOptions(voxel_size=0.1)
 

@@ -8,12 +8,7 @@ from marks import slow_params
 
 from stillmap import _core
 from stillmap.mesh import texture
-from stillmap.mesh.texture import (
-    TexturedMesh,
-    TextureSampler,
-    bake_texture,
-    fill_gutters,
-)
+from stillmap.mesh.texture import TexturedMesh, TextureSampler, bake_texture, fill_gutters
 
 pytest.importorskip("xatlas")
 SMALL = np.array([[200.0, 0, 139.5], [0, 200, 104.5], [0, 0, 1]])
@@ -80,12 +75,7 @@ def square(page: np.ndarray, view: int = 0, z: float = 0.0) -> TexturedMesh:
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     where = np.full(2, 0 if view >= 0 else -1, np.int32)
     return TexturedMesh(
-        np.column_stack([xy, np.full(4, z)]),
-        faces,
-        xy,
-        where,
-        (page,),
-        np.full(2, view, np.int32),
+        np.column_stack([xy, np.full(4, z)]), faces, xy, where, (page,), np.full(2, view, np.int32)
     )
 
 

@@ -11,10 +11,7 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.mesh import views as views_module
-from stillmap.mesh.views import (
-    filter_readable,
-    find_views,
-)
+from stillmap.mesh.views import filter_readable, find_views
 
 S = 10**9
 K = np.array([[10.0, 0.0, 7.5], [0.0, 10.0, 5.5], [0.0, 0.0, 1.0]])
