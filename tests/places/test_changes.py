@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.places import changes
-from stillmap.places.door_leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
+from stillmap.places.changes import Leaf, fit_leaf, is_hinged, turn_about_hinge
 from stillmap.places.evidence import BLOCK, BeamCells, Evidence, crop_without_gaps
 from stillmap.places.place_map import ShownState, label_session
 from stillmap.places.place_states import CellStates, PlaceStates

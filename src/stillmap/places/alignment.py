@@ -327,26 +327,27 @@ def propose_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Hypothesi
     poses = [refiner.refine(T) for T in proposed]
     refined = [Hypothesis(T, compare_maps(place, session, T)) for T in poses]
     best = _distinct_hypotheses(refined, session)[:_MAX_HYPOTHESES]
-    registration = _Registration(place, session)
-    return _distinct_hypotheses([registration.refine(hypothesis) for hypothesis in best], session)
+    return _distinct_hypotheses(_register(place, session, best), session)
 
 
-class _Registration:
-    """The surfaces of a session registered to those of a place, finer than squares."""
-
-    def __init__(self, place: SurfaceMap, session: SurfaceMap) -> None:
-        self._place, self._session = place, session
-        self._grid = _make_grid(place)
-        chosen = spread_evenly(len(session.surface), _REGISTERED_POINTS)
-        self._points = np.ascontiguousarray(session.surface[chosen], np.float32)
-
-    def refine(self, start: Hypothesis) -> Hypothesis:
-        """A hypothesis registered, unless the maps then agree less."""
+def _register(
+    place: SurfaceMap, session: SurfaceMap, hypotheses: list[Hypothesis]
+) -> list[Hypothesis]:
+    """Hypotheses registered finer than squares, unless the maps then agree less."""
+    n, grid = len(place.surface), _core.OccupancyGrid2D(_GRID_CELL, 0.0)
+    surface = np.ascontiguousarray(place.surface, np.float32)
+    weight = np.ones(n, np.float32)
+    ends = np.array([0, n]), np.eye(3)[None]
+    _core.add_end_points(grid, surface, np.ones(n, np.bool_), weight, *ends)
+    chosen = spread_evenly(len(session.surface), _REGISTERED_POINTS)
+    points = np.ascontiguousarray(session.surface[chosen], np.float32)
+    weight, out = np.ones(len(points), np.float32), []
+    for start in hypotheses:
         prior = motion_model.gaussian_prior(start.T, _NO_PRIOR, _NO_PRIOR)
         T, *_ = _core.register_scan(
-            self._grid,
-            self._points,
-            np.ones(len(self._points), np.float32),
+            grid,
+            points,
+            weight,
             prior.T_map_base,
             prior.information,
             **_FIELD,
@@ -358,9 +359,10 @@ class _Registration:
             max_candidates=1,
             T_start=start.T,
         )
-        registered = Hypothesis(T, compare_maps(self._place, self._session, T))
+        registered = Hypothesis(T, compare_maps(place, session, T))
         kept = registered.comparison.score >= _MIN_KEPT * start.comparison.score
-        return registered if kept else start
+        out.append(registered if kept else start)
+    return out
 
 
 def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> list[Hypothesis]:
@@ -383,18 +385,3 @@ def spread_evenly(count: int, max_chosen: int) -> list[int]:
     chosen = np.unique(np.linspace(0, count - 1, min(count, max_chosen)).round().astype(np.intp))
     out: list[int] = chosen.tolist()
     return out
-
-
-def _make_grid(place: SurfaceMap) -> _core.OccupancyGrid2D:
-    """The surfaces of a place as end points."""
-    grid = _core.OccupancyGrid2D(_GRID_CELL, 0.0)
-    n = len(place.surface)
-    _core.add_end_points(
-        grid,
-        np.ascontiguousarray(place.surface, np.float32),
-        np.ones(n, np.bool_),
-        np.ones(n, np.float32),
-        np.array([0, n]),
-        np.eye(3)[None],
-    )
-    return grid

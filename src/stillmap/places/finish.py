@@ -305,7 +305,7 @@ def _placed_record(placed: PlacedSession, first_scan: int, frame: LocalFrame) ->
         "input": placed.session.input,
         "accepted": True,
         "T_place_session": placed.between_maps(placed.T, frame).tolist(),
-        "covariance": placed.known_covariance.tolist(),
+        "covariance": placed.covariance.tolist(),
         "overlap": round(placed.overlap, 4),
         "first_stamp_ns": int(stamp_ns[0]),
         "last_stamp_ns": int(stamp_ns[-1]),

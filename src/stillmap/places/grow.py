@@ -12,17 +12,19 @@ import numpy as np
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
-from stillmap.places import matching
 from stillmap.places.keyframes import Keyframes, Session
-from stillmap.places.matching import KeyframeMatch, Verdict
 from stillmap.places.place import Place, PlacedSession, Tie, optimize_nodes, update_evidence
 from stillmap.places.place_states import PlaceStates, estimate_place, measure_overlap
 from stillmap.places.placement import (
     CORRECTED_STD,
     PREDICTION_STD,
+    KeyframeMatch,
     Placement,
+    Verdict,
     estimate_covariance,
     find_placement,
+    match_sessions,
+    match_sweeps,
     select_references,
 )
 from stillmap.places.surface_map import compare_maps, make_surface_map
@@ -111,8 +113,14 @@ class Growth(ShortRepr):
 
 def start_place(session: Session, resolution: float, voxel_size: float, threads: int) -> Place:
     """A place of one session, in its frame."""
-    place = Place([PlacedSession(session, session.node_poses)], [], resolution, voxel_size)
-    return update_evidence(place, threads)
+    first = _place_session(session, session.node_poses)
+    return update_evidence(Place([first], [], resolution, voxel_size), threads)
+
+
+def _place_session(session: Session, nodes: Float) -> PlacedSession:
+    """A session at poses of its nodes that count as certain."""
+    dof = 3 * (session.dimension - 1)
+    return PlacedSession(session, nodes, np.zeros((dof, dof)))
 
 
 def add_session(
@@ -130,7 +138,7 @@ def add_session(
     placement = find_placement(place.sessions, session)
     if placement.refused and not placement.rivals:
         return Growth(place, placement.refused)
-    start = placed = PlacedSession(session, lift_alignment(place, session, placement))
+    start = placed = _place_session(session, lift_alignment(place, session, placement))
     matches, states = placement.matches, None
     if place.dimension == 3:
         matches = match_session(place, placed, PREDICTION_STD, None, threads)
@@ -177,7 +185,7 @@ def _beats_rivals(
         return False
     for T in placement.rivals:
         nodes = lift_alignment(place, session, replace(placement, T=T))
-        rival = match_session(place, PlacedSession(session, nodes), PREDICTION_STD, None, threads)
+        rival = match_session(place, _place_session(session, nodes), PREDICTION_STD, None, threads)
         if unexplained > _MAX_UNEXPLAINED_RATIO * _unexplained_share(rival):
             return False
     return True
@@ -216,9 +224,9 @@ def match_session(
     for index in select_references(place.sessions, session.planar, planar_poses):
         reference = place.sessions[index]
         if place.dimension == 3:
-            out[index] = matching.match_sweeps(reference, placed, std, nodes, threads)
+            out[index] = match_sweeps(reference, placed, std, nodes, threads)
             continue
-        out[index] = matching.match_sessions(
+        out[index] = match_sessions(
             _weigh(reference.session.planar, reference.planar_poses, states),
             reference.planar_poses,
             _weigh(session.planar, planar_poses, states),

@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -153,14 +154,16 @@ def prepare_sessions(
     Raises:
         InputError: an input cannot be read or mapped.
     """
-    out = []
-    for number, session in enumerate(inputs, start=1):
+    return [
+        _prepare_session(session, options, odometry, folder, partial(_report, progress, number))
+        for number, session in enumerate(inputs, start=1)
+    ]
 
-        def report(stage: str, iteration: int, done: int, total: int, number: int = number) -> None:
-            progress(f"session {number}: {stage}", iteration, done, total)
 
-        out.append(_prepare_session(session, options, odometry, folder, report))
-    return out
+def _report(
+    progress: Progress, number: int, stage: str, iteration: int, done: int, total: int
+) -> None:
+    progress(f"session {number}: {stage}", iteration, done, total)
 
 
 def _prepare_session(

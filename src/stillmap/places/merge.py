@@ -6,8 +6,9 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -87,9 +88,9 @@ def merge_sessions(
         place, refused = _grow(place, sessions, job, threads, progress)
         refusals += refused
         if len(place.sessions) < 2:
-            raise InputError(
-                _describe_failure(refusals), hint="add a session whose route overlaps both"
-            )
+            reasons = "; ".join(f"{refusal.name}: {refusal.why}" for refusal in refusals)
+            what = f"fewer than two sessions could be placed: {reasons}"
+            raise InputError(what, hint="add a session whose route overlaps both")
         if job.frame is not None:
             place = update_evidence(_reframe(place, job.frame), threads)
         for refusal in refused:
@@ -168,7 +169,8 @@ def _add_all(
             if session.dimension != place.dimension:
                 why = f"it is in {session.dimension}D, the place in {place.dimension}D"
             else:
-                growth = add_session(place, session, threads, _step(progress, session))
+                report = partial(_report_step, progress, session.name)
+                growth = add_session(place, session, threads, report)
                 place, why = growth.place, growth.refused
             if why:
                 refusals[session.name] = PlaceSession(session.name, session.input, False, why)
@@ -179,8 +181,8 @@ def _add_all(
     return place, [refusals[session.name] for session in pending]
 
 
-def _step(progress: Progress, session: Session) -> Callable[[str], None]:
-    return lambda step: progress(f"{session.name}: {step}", 0, 0, 0)
+def _report_step(progress: Progress, name: str, step: str) -> None:
+    progress(f"{name}: {step}", 0, 0, 0)
 
 
 def _reframe(place: Place, name: str) -> Place:
@@ -215,11 +217,6 @@ def _check_job(job: MergeJob, names: Sequence[str]) -> None:
 def _no_frame(name: str, known: Sequence[str]) -> InputError:
     hint = f"frame=NAME wants one of {', '.join(known)}"
     return InputError(f"cannot have the frame of {name}: no such session in the place", hint=hint)
-
-
-def _describe_failure(refusals: Sequence[PlaceSession]) -> str:
-    reasons = "; ".join(f"{refusal.name}: {refusal.why}" for refusal in refusals)
-    return f"fewer than two sessions could be placed: {reasons}"
 
 
 def merge(

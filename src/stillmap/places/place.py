@@ -126,7 +126,7 @@ class PlacedSession(ShortRepr):
     Attributes:
         session: T scans, K keyframes, N nodes.
         nodes: (N, D+1, D+1) T_place_base of the nodes of its pose graph.
-        covariance: (3, 3), in 3D (6, 6), of its alignment at its first scan; None: it is the first.
+        covariance: (3, 3), in 3D (6, 6), of its alignment at its first scan; 0 of the first.
         overlap: share of its hits in area that the sessions before it knew; 1 of the first.
         evidence: in D dimensions; None: not measured yet.
         planar_evidence: in the plane; in 2D the same.
@@ -135,7 +135,7 @@ class PlacedSession(ShortRepr):
 
     session: Session
     nodes: Float
-    covariance: Float | None = None
+    covariance: Float
     overlap: float = 1.0
     evidence: Evidence | None = None
     planar_evidence: Evidence | None = None
@@ -169,14 +169,6 @@ class PlacedSession(ShortRepr):
     def planar_poses(self) -> Float:
         """(K, 3, 3) poses of the planar keyframes."""
         return to_planar(self.session, self.keyframe_poses)
-
-    @property
-    def known_covariance(self) -> Float:
-        """(3, 3), in 3D (6, 6): `covariance`, or 0."""
-        if self.covariance is not None:
-            return self.covariance
-        dof = 3 * (self.session.dimension - 1)
-        return np.zeros((dof, dof))
 
     def require_evidence(self) -> tuple[Evidence, Evidence]:
         """The evidence in D dimensions and in the plane.

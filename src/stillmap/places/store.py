@@ -83,11 +83,7 @@ def write_placement(home: Path, placed: PlacedSession) -> None:
     """Write where a session lies in its place, and its evidence there."""
     state = home / STATE
     evidence, planar = placed.require_evidence()
-    of = {
-        "nodes": placed.nodes,
-        "covariance": placed.known_covariance,
-        "measured_at": placed.measured_at,
-    }
+    of = {"nodes": placed.nodes, "covariance": placed.covariance, "measured_at": placed.measured_at}
     write_arrays(state, of)
     _write_evidence(state / "evidence.npz", evidence)
     if planar is not evidence:
@@ -148,13 +144,13 @@ def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
         what = "names other sessions than run.json: one of them was changed by hand"
         raise InputError(what, where=str(folder / SESSIONS), hint=HINT)
     if settings.frame not in accepted:
-        raise InputError("is no record of a place", where=str(folder / RECORD), hint=HINT)
+        raise _inconsistent(folder / RECORD)
     sessions = [
         _read_placed(folder / "sessions" / name, accepted[name], settings.voxel_size)
         for name in order
     ]
     if len({placed.session.dimension for placed in sessions}) != 1:
-        raise InputError("has sessions in 2D and in 3D", where=str(folder), hint=HINT)
+        raise _inconsistent(folder)
     # that of the first one stays by itself: its first pose is what the pose graph holds
     frame = None if settings.frame == order[0] else settings.frame
     ties = _read_ties(folder / TIES, sessions)
@@ -173,7 +169,7 @@ def _read_placed(home: Path, record: PlaceSession, voxel_size: float) -> PlacedS
     measured_at = read_poses(state / "measured_at.npy", K, D, MAX_DISTANCE)
     covariance = np.array(read_array(state / "covariance.npy", (3 * (D - 1),) * 2, np.float64))
     if not np.isfinite(covariance).all():
-        raise InputError("is not finite", where=str(state / "covariance.npy"), hint=HINT)
+        raise _inconsistent(state / "covariance.npy")
     evidence = planar = _read_evidence(state / "evidence.npz", D)
     if D == 3:
         planar = _read_evidence(state / "planar_evidence.npz", 2)
@@ -184,10 +180,9 @@ def _read_beams(folder: Path) -> tuple[Int64, int]:
     """(T,) stamps of the scans of a session, and the number of its beams."""
     stamp_ns = np.array(read_array(folder / "stamp_ns.npy", (None,), np.int64))
     offset = np.array(read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64))
-    if offset[0] != 0 or np.any(np.diff(offset) < 0):
-        raise InputError("does not rise from 0", where=str(folder / "offset.npy"), hint=HINT)
-    if np.any(stamp_ns[1:] < stamp_ns[:-1]) or not len(stamp_ns):
-        raise InputError("stamps decrease", where=str(folder / "stamp_ns.npy"), hint=HINT)
+    rises = offset[0] == 0 and (np.diff(offset) >= 0).all() and (np.diff(stamp_ns) >= 0).all()
+    if not len(stamp_ns) or not rises:
+        raise _inconsistent(folder)
     read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
     return stamp_ns, int(offset[-1])
 
@@ -276,7 +271,7 @@ def _read_evidence(path: Path, D: int) -> Evidence:
     kinds = corner.dtype == np.int32 and hits.dtype == np.uint8 and passes.dtype == np.uint8
     is_usable = fits and kinds and resolution.shape == () and 0.0 < float(resolution) < 100.0
     if not is_usable or np.any(corner % BLOCK[D]):
-        raise InputError("is damaged", where=str(path), hint=HINT)
+        raise _inconsistent(path)
     return Evidence(corner, hits, passes, float(resolution))
 
 
@@ -285,21 +280,22 @@ def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     *columns, T, covariance = read_npz(path, (*_TIES, "T", "covariance"), _MAX_ARRAY, HINT).values()
     L, counts = len(columns[0]), np.array([len(placed.nodes) for placed in sessions])
     shapes = [(L,)] * 4 + [(L, D + 1, D + 1), (L, 3 * (D - 1), 3 * (D - 1))]
-    every = [*columns, T, covariance]
-    if [array.shape for array in every] != shapes or any(
+    if [array.shape for array in (*columns, T, covariance)] != shapes or any(
         column.dtype.kind != "i" for column in columns
     ):
-        raise InputError("is damaged: arrays of other shapes", where=str(path), hint=HINT)
-    first, first_node, second, second_node = columns
-    for session, node in ((first, first_node), (second, second_node)):
-        inside = (session >= 0) & (session < len(sessions)) & (node >= 0)
-        if not inside.all() or (node >= counts[session]).any() or (first == second).any():
-            raise InputError("names a session or node that is not there", where=str(path))
-    usable = bool((np.abs(T) < MAX_DISTANCE).all()) and bool(np.isfinite(covariance).all())
-    if not usable or (L and np.linalg.eigvalsh(covariance).min() <= 0.0):
-        raise InputError("is damaged: no transforms or covariances", where=str(path), hint=HINT)
-    ends = zip(*(column.tolist() for column in columns), strict=True)
-    return [Tie(a, i, b, j, T[k], covariance[k]) for k, (a, i, b, j) in enumerate(ends)]
+        raise _inconsistent(path)
+    ends = np.array(columns)
+    sessions_of, nodes = ends[::2], ends[1::2]
+    inside = (sessions_of >= 0) & (sessions_of < len(sessions)) & (nodes >= 0)
+    inside &= nodes < counts[sessions_of % len(sessions)]
+    apart = (sessions_of[0] != sessions_of[1]).all()
+    usable = (np.abs(T) < MAX_DISTANCE).all() and np.isfinite(covariance).all()
+    if not (inside.all() and apart and usable):
+        raise _inconsistent(path)
+    if L and np.linalg.eigvalsh(covariance).min() <= 0.0:
+        raise _inconsistent(path)
+    rows = enumerate(ends.T.tolist())
+    return [Tie(a, i, b, j, T[k], covariance[k]) for k, (a, i, b, j) in rows]
 
 
 def _inconsistent(folder: Path) -> InputError:

@@ -161,8 +161,8 @@ def find_sides(passed: Bool) -> Float32:
 
 def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
     """Reduces squares of cells (X, Y) to one number each."""
-    rows = reduce.reduce([cells[k::_STEP] for k in range(_STEP)])
-    return np.asarray(reduce.reduce([rows[:, k::_STEP] for k in range(_STEP)]))
+    X, Y = (n // _STEP for n in cells.shape)
+    return np.asarray(reduce.reduce(cells.reshape(X, _STEP, Y, _STEP), axis=(1, 3)))
 
 
 def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> Comparison:
