@@ -2,16 +2,15 @@
 
 import resource
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
+from surfel_maps import fit_surfels
 
 
 @dataclass(frozen=True)
@@ -24,31 +23,31 @@ class Beams:
     resolution: float
 
     @property
-    def dimension(self) -> int:
+    def dimension(self):
         return self.points.shape[1]
 
-    def grid(self, kernels: ModuleType, threads: int = 1) -> Any:
+    def grid(self, kernels, threads=1):
         """The grid of all beams."""
         grid = self.empty_grid(kernels)
-        kernels.add_beams(
-            grid, self.points, self.hit, self.e, self.offset, self.T_map_sensor, threads
-        )
+        kernels.add_beams(grid, *self.weighted, threads)
         return grid
 
-    def empty_grid(self, kernels: ModuleType) -> Any:
-        return (kernels.OccupancyGrid2D if self.dimension == 2 else kernels.OccupancyGrid3D)(
-            self.resolution
-        )
+    def empty_grid(self, kernels):
+        return getattr(kernels, f"OccupancyGrid{self.dimension}D")(self.resolution)
 
     @property
-    def arguments(self) -> tuple[Any, ...]:
+    def arguments(self):
         return self.points, self.hit, self.offset, self.T_map_sensor
 
-    def with_(self, **changes: Any) -> "Beams":
+    @property
+    def weighted(self):
+        return self.points, self.hit, self.e, self.offset, self.T_map_sensor
+
+    def with_(self, **changes):
         return replace(self, **changes)
 
 
-def random_rotation(rng: np.random.Generator, dimension: int) -> Any:
+def random_rotation(rng, dimension):
     q, r = np.linalg.qr(rng.normal(size=(dimension, dimension)))
     q *= np.sign(np.diag(r))
     if np.linalg.det(q) < 0:
@@ -56,7 +55,7 @@ def random_rotation(rng: np.random.Generator, dimension: int) -> Any:
     return q
 
 
-def random_beams(seed: int, dimension: int, scans: int = 12, beams: int = 240) -> Beams:
+def random_beams(seed, dimension, scans=12, beams=240):
     """Ragged scans, some of them empty, on both sides of the origin; NaN, maximum range, any e."""
     rng = np.random.default_rng(seed)
     cuts = np.sort(rng.integers(0, beams + 1, scans - 1))
@@ -76,7 +75,7 @@ def random_beams(seed: int, dimension: int, scans: int = 12, beams: int = 240) -
     )
 
 
-def ranges(origins: Any, directions: Any, walls: Any, mover: Any, radius: float) -> Any:
+def ranges(origins, directions, walls, mover, radius):
     """Ranges of rays in a convex room (normals, distances) to its walls or a ball."""
     normals, distances = walls
     with np.errstate(divide="ignore"):
@@ -97,44 +96,23 @@ class Room:
     time_bin: Any
     lengths: dict[str, float]
 
-    def surface(self, kernels: ModuleType) -> Any:
-        surface = (kernels.SurfelMap2D, kernels.SurfelMap3D)[self.beams.dimension - 2](
-            self.beams.resolution
-        )
-        surface.add_end_points(*self.beams.arguments)
-        surface.fit()
-        return surface
+    def surface(self, kernels):
+        kind = f"SurfelMap{self.beams.dimension}D"
+        return fit_surfels(kernels, kind, self.beams.resolution, *self.beams.arguments)
 
-    def hmm(
-        self,
-        kernels: ModuleType,
-        surface: Any,
-        rho: list[float],
-        tau: list[float],
-        view_angle: list[float] | None = None,
-        p_detection: float = 0.8,
-        **changes: float,
-    ) -> Any:
-        return (kernels.OccupancyHmm2D, kernels.OccupancyHmm3D)[self.beams.dimension - 2](
-            surface,
-            rho=rho,
-            tau=tau,
-            view_angle=view_angle or [],
-            p_detection=p_detection,
-            bin_seconds=1.0,
-            **{**self.lengths, **changes},
-        )
+    def hmm(self, kernels, surface, rho, tau, view_angle=None, p_detection=0.8, **changes):
+        model = {"rho": rho, "tau": tau, "view_angle": view_angle or [], "bin_seconds": 1.0}
+        kind = getattr(kernels, f"OccupancyHmm{self.beams.dimension}D")
+        return kind(surface, p_detection=p_detection, **{**model, **self.lengths, **changes})
 
-    def scans(self, first: int, last: int) -> tuple[Any, ...]:
+    def scans(self, first, last):
         b = self.beams
         part = slice(b.offset[first], b.offset[last])
         offset = b.offset[first : last + 1] - b.offset[first]
         return b.points[part], b.hit[part], offset, b.T_map_sensor[first:last]
 
 
-def make_room(
-    seed: int, dimension: int, resolution: float, scans: int, beams: int, noise: float = 0.01
-) -> Room:
+def make_room(seed, dimension, resolution, scans, beams, noise=0.01):
     """A slanted box of walls around the origin with a moving ball."""
     rng = np.random.default_rng(seed)
     R = random_rotation(rng, dimension)
@@ -177,25 +155,25 @@ def make_room(
 
 
 @pytest.fixture(scope="session")
-def a_room() -> Callable[..., Room]:
+def a_room():
     """Makes rooms."""
     return make_room
 
 
 @pytest.fixture(scope="session")
-def some_beams() -> Callable[..., Beams]:
+def some_beams():
     """Makes random beams of a seed and a dimension."""
     return random_beams
 
 
 @pytest.fixture(params=[(2, 1), (2, 2), (3, 3), (3, 4)], ids=lambda p: f"{p[0]}D-{p[1]}")
-def beams(request: pytest.FixtureRequest) -> Beams:
+def beams(request):
     dimension, seed = request.param
     return random_beams(seed, dimension)
 
 
 @pytest.fixture
-def bounded_memory() -> Iterator[None]:
+def bounded_memory():
     """An endless traversal raises MemoryError before it exhausts the machine."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     # in addition to mapped memory: address sanitizers reserve terabytes

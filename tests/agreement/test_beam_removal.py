@@ -22,10 +22,7 @@ def beams(D, rng, n=200):
 def test_removal_is_exact(D, approach):
     rng = np.random.default_rng(D)
     one, other = beams(D, rng), beams(D, rng)
-    grids = [
-        (_core.OccupancyGrid2D if D == 2 else _core.OccupancyGrid3D)(0.1, approach)
-        for _ in range(2)
-    ]
+    grids = [getattr(_core, f"OccupancyGrid{D}D")(0.1, approach) for _ in range(2)]
     _core.add_beams(grids[0], *one)
     _core.add_beams(grids[1], *other)
     _core.add_beams(grids[1], *one, threads=2)
@@ -44,7 +41,7 @@ def test_removal_is_exact(D, approach):
 def test_the_approach_changes_only_registration(D):
     rng = np.random.default_rng(D)
     taken = beams(D, rng)
-    Grid = _core.OccupancyGrid2D if D == 2 else _core.OccupancyGrid3D
+    Grid = getattr(_core, f"OccupancyGrid{D}D")
     plain, kind = Grid(0.1), Grid(0.1, 0.5)
     for grid in (plain, kind):
         _core.add_beams(grid, *taken)
@@ -68,6 +65,5 @@ def test_a_grazed_wall_keeps_its_weight():
     for approach in (0.0, 1.0):
         grid = _core.OccupancyGrid2D(0.05, approach)
         _core.add_beams(grid, points, hit, ones, offset, T)
-        options = {"sigma": 0.05, "radius": 2, "floor": 0.05, "unknown": 0.0}
-        costs.append(_core.registration_cost(grid, points, ones, T[0], **options))
+        costs.append(_core.registration_cost(grid, points, ones, T[0], 0.05, 2, 0.05, 0.0))
     assert costs[1] < costs[0] - 1.0

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import reference
+from surfel_maps import fit_surfels
 
 from stillmap import _core
 
@@ -31,43 +32,24 @@ def lanes(seed=3):
 
 
 def beams_of(seen):
-    """One scan per time bin, lanes 1 m apart: beams end in the cell at x = 2.05, or behind it."""
-    points, hit, offset = [], [], [0]
-    for of_bin in seen.T:
-        for lane in np.flatnonzero(of_bin != NOT_SEEN):
-            points.append((2.05 if of_bin[lane] == HIT else 4.05, lane + 0.05))
-            hit.append(True)
-        offset.append(len(points))
-    return np.array(points, np.float32), np.array(hit), np.array(offset)
+    """Beams, and the time bin of each: scans of their own, which start at x = 0 of their lane.
 
-
-def parallel_poses(points, offset):
-    """Every beam starts at x = 0 of its lane, so each is a scan of its own."""
-    T = np.tile(np.eye(3), (len(points), 1, 1))
-    T[:, 1, 2] = points[:, 1]
-    along = np.stack([points[:, 0], np.zeros(len(points))], axis=1).astype(np.float32)
-    bins = np.repeat(np.arange(len(offset) - 1), np.diff(offset))
-    return along, np.arange(len(points) + 1), T, bins
+    Lanes are 1 m apart; beams end in the cell at x = 2.05, or behind it.
+    """
+    bins, lane = np.nonzero(seen.T != NOT_SEEN)
+    reach = np.where(seen[lane, bins] == HIT, 2.05, 4.05)
+    along = np.stack([reach, np.zeros(len(lane))], axis=1).astype(np.float32)
+    T = np.tile(np.eye(3), (len(lane), 1, 1))
+    T[:, 1, 2] = (lane + 0.05).astype(np.float32)
+    return along, np.ones(len(lane), bool), np.arange(len(lane) + 1), T, bins
 
 
 def changes_of(kernels, seen, number, threads=1, chunk=None, **asked):
-    points, hit, offset = beams_of(seen)
-    along, own, T, bins = parallel_poses(points, offset)
-    surface = kernels.SurfelMap2D(0.1)
-    surface.add_end_points(along, hit, own, T)
-    surface.fit()
-    hmm = kernels.OccupancyHmm2D(
-        surface,
-        rho=[0.5],
-        tau=[1.0],
-        p_detection=0.9,
-        bin_seconds=SECONDS,
-        lateral_std=0.001,
-        margin=0.2,
-        hit_radius=0.05,
-        end_margin=0.3,
-        use_normals=False,
-    )
+    along, hit, own, T, bins = beams_of(seen)
+    surface = fit_surfels(kernels, "SurfelMap2D", 0.1, along, hit, own, T)
+    lengths = {"lateral_std": 0.001, "margin": 0.2, "hit_radius": 0.05, "end_margin": 0.3}
+    model = {"rho": [0.5], "tau": [1.0], "p_detection": 0.9, "bin_seconds": SECONDS}
+    hmm = kernels.OccupancyHmm2D(surface, **model, **lengths, use_normals=False)
     hmm.track_changes(**MODEL, **asked)
     step = chunk or len(number)
     for first in range(0, len(number), step):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 from marks import slow_params
-from surfel_maps import fit_both, order
+from surfel_maps import fit_both, fit_surfels, order
 
 from stillmap import _core
 
@@ -26,15 +26,11 @@ def scattered(seed, n=900, scans=6):
     return points.astype(np.float32), rng.random(n) < 0.9, offset, T
 
 
-def surfaces(beams, resolution=0.2):
-    return fit_both("SurfelMap3D", resolution, *beams)
-
-
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
 @pytest.mark.parametrize(("column", "fewest"), [(1, 1), (2, 5), (3, 12)])
 def test_agreement(seed, column, fewest):
     beams = scattered(seed)
-    core, plain = surfaces(beams)
+    core, plain = fit_both("SurfelMap3D", 0.2, *beams)
     of_core, of_plain = order(core), order(plain)
     rng = np.random.default_rng(seed + 9)
     stands, values = rng.random(plain.size) < 0.8, rng.normal(0, 2, (plain.size, 2))
@@ -55,9 +51,7 @@ def test_agreement(seed, column, fewest):
 
 def test_threads_and_chunks_change_nothing():
     points, hit, offset, T = scattered(4, 30000, 60)
-    surface = _core.SurfelMap3D(0.2)
-    surface.add_end_points(points, hit, offset, T)
-    surface.fit()
+    surface = fit_surfels(_core, "SurfelMap3D", 0.2, points, hit, offset, T)
     values = np.random.default_rng(1).random((surface.size, 1)).astype(np.float32)
     stands = np.ones(surface.size, bool)
     found = []
@@ -83,7 +77,7 @@ def test_ground_contact_agreement(seed, column, least, share):
     points, hit, offset, T = scattered(seed, 800)
     points = np.concatenate([points, floor.astype(np.float32)])[rng.permutation(2400)]
     beams = points, np.tile(hit, 3), 3 * offset, np.tile(np.eye(4), (len(T), 1, 1))
-    core, plain = surfaces(beams)
+    core, plain = fit_both("SurfelMap3D", 0.2, *beams)
     of_core, of_plain = order(core), order(plain)
     low = rng.random(plain.size) < 0.5
     p, ground = rng.random(plain.size), rng.normal(0.0, 0.05, plain.size)
@@ -95,21 +89,12 @@ def test_ground_contact_agreement(seed, column, least, share):
         stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, 0.6 * p), ground
         at_any_height[of] = any_height
         known = {"is_obstacle": stands, "p_static": mine[0], "ground_height": mine[1]}
-        known["at_any_height"] = at_any_height
-        surfel = surface.associate_beams(*beams)
+        known |= {"at_any_height": at_any_height, "column_cells": column}
+        known |= {"max_ground_height": 0.15, "min_end_height": least}
+        ends = (*beams, surface.associate_beams(*beams))
         for threads in (1, 3):
-            found.append(
-                kernels.relabel_ground_contact(
-                    surface,
-                    *beams,
-                    surfel,
-                    **known,
-                    column_cells=column,
-                    max_ground_height=0.15,
-                    min_end_height=least,
-                    threads=threads,
-                )
-            )
+            relabelled = kernels.relabel_ground_contact(surface, *ends, **known, threads=threads)
+            found.append(relabelled)
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_allclose(found[0], found[2], atol=1e-6)
     assert 5 <= np.isfinite(found[2]).sum() < 700
@@ -121,27 +106,21 @@ def row_of(*x):
     return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)
 
 
-def share_of(scans, moving, column=1, fewest=1):
+def share_of(*scans, moving):
     """{x of the cell: mean of its cluster}."""
     points, offset = np.concatenate(scans), np.cumsum([0, *map(len, scans)])
     hit, T = np.ones(len(points), bool), np.repeat(IDENTITY, len(scans), axis=0)
-    surface = _core.SurfelMap3D(1.0)
-    surface.add_end_points(points, hit, offset, T)
-    surface.fit()
+    surface = fit_surfels(_core, "SurfelMap3D", 1.0, points, hit, offset, T)
     x = surface.surfels()[0][:, 0]
     is_moving = np.isin(x, moving).astype(np.float32)[:, None]
-    pooling = _core.ClusterPooling3D(
-        surface, np.ones(len(x), bool), is_moving, column_cells=column, min_surfels=fewest
-    )
+    stands = np.ones(len(x), bool)
+    pooling = _core.ClusterPooling3D(surface, stands, is_moving, column_cells=1, min_surfels=1)
     pooling.add(points, hit, offset, T)
     return dict(zip(x.tolist(), pooling.means()[:, 0].tolist(), strict=True))
 
 
-def test_separate_clusters():
-    share = share_of([row_of(0, 1, 2, 3, 5, 6)], moving=[3])
+def test_clusters_are_apart_and_sweeps_have_equal_weights():
+    share = share_of(row_of(0, 1, 2, 3, 5, 6), moving=[3])
     assert share == {0: 0.25, 1: 0.25, 2: 0.25, 3: 0.25, 5: 0.0, 6: 0.0}
-
-
-def test_sweeps_have_equal_weights():
-    share = share_of([row_of(0, 1), row_of(0), row_of(0), row_of(0)], moving=[1])
+    share = share_of(row_of(0, 1), row_of(0), row_of(0), row_of(0), moving=[1])
     assert share == {0: 0.125, 1: 0.5}

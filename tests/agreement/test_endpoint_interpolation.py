@@ -13,9 +13,7 @@ LOOSE = {"max_gap": 0.6, "tolerance": 0.15, "max_gap_ratio": 1.6}  # for random 
 def filled(kernels, beams, options=OPTIONS):
     """A grid of the interpolated end points only."""
     grid = beams.empty_grid(kernels)
-    kernels.interpolate_end_points(
-        grid, beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor, **options
-    )
+    kernels.interpolate_end_points(grid, *beams.weighted, **options)
     return grid
 
 
@@ -131,12 +129,11 @@ def test_scenes(laid, kind):
 @pytest.mark.parametrize("kind", list(SURFACES))
 def test_removal_is_exact(laid, kind):
     beams = laid(kind, "wall")
-    filling = beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor
     grid, never = beams.grid(_core), beams.grid(_core)
     before = [a.tobytes() for a in grid.dense()]
-    _core.interpolate_end_points(grid, *filling, **OPTIONS)
+    _core.interpolate_end_points(grid, *beams.weighted, **OPTIONS)
     assert [a.tobytes() for a in grid.dense()] != before
-    _core.interpolate_end_points(grid, *filling, **OPTIONS, remove=True)
+    _core.interpolate_end_points(grid, *beams.weighted, **OPTIONS, remove=True)
     assert [a.tobytes() for a in grid.dense()] == before
     weights = np.ones(len(beams.points), np.float32)
     probes = beams.points, weights, beams.T_map_sensor[0], 0.04, 2, 0.05, 0.05
@@ -147,67 +144,47 @@ def test_removal_is_exact(laid, kind):
 # by hand: which gaps are filled, on cells of 0.1 m
 
 
-def between(kernels, points, hit=None, e=None, **changes):
-    """{cell along x: alpha} of the interpolated end points."""
+ROW, BEND = ((0.06, 0), (0.44, 0), (0.71, 0)), ((0.06, 0), (0.44, 0), (0.71, 0.11))
+UNEVEN = ((0.06, 0), (0.16, 0), (0.51, 0))
+# from 0.06 on over 0.38 m in four steps: 0.155, 0.25, 0.345; then 0.27 m in three: 0.53, 0.62
+ALL = dict.fromkeys([1, 2, 3, 5, 6], 1.0)
+
+
+@pytest.mark.parametrize("kernels", [reference, _core])
+@pytest.mark.parametrize(
+    ("points", "changes", "cells"),
+    [
+        (ROW, {}, ALL),
+        (ROW[::-1], {}, ALL),
+        (ROW, {"e": [0.5, 0.75, 0.25]}, {1: 0.5, 2: 0.5, 3: 0.5, 5: 0.25, 6: 0.25}),
+        (ROW, {"e": [0, 1, 1]}, {5: 1, 6: 1}),
+        # two end points are not a surface
+        (ROW[:2], {}, {}),
+        ((), {}, {}),
+        (ROW, {"hit": [1, 1, 0]}, {}),
+        ((*ROW[:2], (np.nan, 0)), {}, {}),
+        ((*ROW[:2], ROW[1]), {}, {}),
+        # 0.1 m, then 0.35 m: more than three times as wide, and the other way round less
+        (UNEVEN, {}, {}),
+        (UNEVEN, {"max_gap_ratio": 3.6}, {2: 1, 3: 1, 4: 1}),
+        (UNEVEN, {"max_gap_ratio": 3.6, "max_gap": 0.34}, {}),
+        # the last one is 0.11 m off the line of the others, the first one 0.14 m
+        ((*ROW[:2], (0.11, 0)), {}, {}),
+        (BEND, {"tolerance": 0.1}, {}),
+        (BEND, {"tolerance": 0.13}, {1: 1, 2: 1, 3: 1}),
+        (BEND, {"tolerance": 0.16}, ALL),
+    ],
+)
+def test_cells_by_hand(kernels, points, changes, cells):
     points = np.array(points, np.float32).reshape(-1, 2) + np.float32([0, 0.05])
     n = len(points)
+    options = {"hit": np.ones(n), "e": np.ones(n), **OPTIONS, **changes}
+    hit, e = np.array(options.pop("hit"), bool), np.array(options.pop("e"), np.float32)
     grid = kernels.OccupancyGrid2D(0.1)
     kernels.interpolate_end_points(
-        grid,
-        points,
-        np.ones(n, bool) if hit is None else np.array(hit, bool),
-        np.ones(n, np.float32) if e is None else np.array(e, np.float32),
-        np.array([0, n]),
-        np.eye(3)[None],
-        **{**OPTIONS, **changes},
+        grid, points, hit, e, np.array([0, n]), np.eye(3)[None], **options
     )
     first, alpha, _ = grid.dense()
     columns = alpha.sum(axis=0)
-    return {int(first[0] + x): pytest.approx(columns[x]) for x in np.flatnonzero(columns)}
-
-
-both = pytest.mark.parametrize("kernels", [reference, _core])
-
-
-@both
-def test_cells_by_hand(kernels):
-    # from 0.06 on over 0.38 m in four steps: 0.155, 0.25, 0.345; then 0.27 m in three: 0.53, 0.62
-    there = [(0.06, 0), (0.44, 0), (0.71, 0)]
-    assert between(kernels, there) == {1: 1, 2: 1, 3: 1, 5: 1, 6: 1}
-    assert between(kernels, there[::-1]) == {1: 1, 2: 1, 3: 1, 5: 1, 6: 1}
-    assert between(kernels, there, e=[0.5, 0.75, 0.25]) == {
-        1: 0.5,
-        2: 0.5,
-        3: 0.5,
-        5: 0.25,
-        6: 0.25,
-    }
-    assert between(kernels, there, e=[0, 1, 1]) == {5: 1, 6: 1}
-
-
-@both
-def test_two_end_points_are_not_a_surface(kernels):
-    assert between(kernels, [(0.06, 0), (0.44, 0)]) == {}
-    assert between(kernels, []) == {}
-    assert between(kernels, [(0.06, 0), (0.44, 0), (0.71, 0)], hit=[1, 1, 0]) == {}
-    assert between(kernels, [(0.06, 0), (0.44, 0), (np.nan, 0)]) == {}
-    assert between(kernels, [(0.06, 0), (0.44, 0), (0.44, 0)]) == {}
-
-
-@both
-def test_max_gap_ratio(kernels):
-    # 0.1 m, then 0.35 m: more than three times as wide, and the other way round less
-    there = [(0.06, 0), (0.16, 0), (0.51, 0)]
-    assert between(kernels, there) == {}
-    assert between(kernels, there, max_gap_ratio=3.6) == {2: 1, 3: 1, 4: 1}
-    assert between(kernels, there, max_gap_ratio=3.6, max_gap=0.34) == {}
-
-
-@both
-def test_bent_surfaces(kernels):
-    assert between(kernels, [(0.06, 0), (0.44, 0), (0.11, 0)]) == {}
-    # the last one is 0.11 m off the line of the others, the first one 0.14 m
-    bend = [(0.06, 0), (0.44, 0), (0.71, 0.11)]
-    assert between(kernels, bend, tolerance=0.1) == {}
-    assert list(between(kernels, bend, tolerance=0.13)) == [1, 2, 3]
-    assert list(between(kernels, bend, tolerance=0.16)) == [1, 2, 3, 5, 6]
+    found = {int(first[0] + x): columns[x] for x in np.flatnonzero(columns)}
+    assert found == pytest.approx(cells)

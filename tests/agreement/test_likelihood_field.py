@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import reference
 from reference.likelihood_field import retract
+from surfel_maps import together
 
 from stillmap import _core
 from stillmap.core import se2
@@ -66,15 +67,11 @@ def test_surface_that_goes_on_beyond_the_map():
     rng = np.random.default_rng(0)
     wall = np.stack([np.arange(-3.5, 0.5, 0.03), np.full(134, 1.5)], axis=-1)
     wall += rng.normal(scale=0.01, size=wall.shape)
-    T = np.eye(3)[None].copy()
     grids = []
     for kernels in (_core, reference):
         grid = kernels.OccupancyGrid2D(0.05)
-        known = wall[wall[:, 0] < -1.1].astype(np.float32)
-        n = len(known)
-        kernels.add_beams(
-            grid, known, np.ones(n, bool), np.ones(n, np.float32), np.array([0, n]), T
-        )
+        known, hit, offset, T = together(wall[wall[:, 0] < -1.1])
+        kernels.add_beams(grid, known, hit, np.ones(len(known), np.float32), offset, T)
         grids.append(grid)
     points, weights = wall.astype(np.float32), np.ones(len(wall), np.float32)
     normals, isotropy = _core.estimate_normals(

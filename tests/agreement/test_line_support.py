@@ -4,19 +4,11 @@ import numpy as np
 import pytest
 import reference
 from marks import slow_params
+from surfel_maps import assert_same_bits, fit_both, fit_surfels, order, together
 
 from stillmap import _core
 
 LINES = {"radius": 20.0, "gap": 3.0, "half_width": 1.2}
-
-
-def surfel_map(kernels, ends, resolution=0.05):
-    ends = np.asarray(ends, np.float32)
-    T = np.eye(3)[None]
-    made = kernels.SurfelMap2D(resolution)
-    made.add_end_points(ends, np.ones(len(ends), bool), np.array([0, len(ends)]), T)
-    made.fit()
-    return made
 
 
 def end_points(seed):
@@ -28,14 +20,10 @@ def end_points(seed):
     return np.concatenate([wall, slanted, rng.uniform(-2.0, 2.0, (80, 2))])
 
 
-def order(surfels):
-    return np.lexsort(surfels.surfels()[0].T)
-
-
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
 @pytest.mark.parametrize("changes", [{}, {"gap": 0.0}, {"radius": 1.5, "gap": 1.0}])
 def test_agreement(seed, changes):
-    core, plain = (surfel_map(kernels, end_points(seed)) for kernels in (_core, reference))
+    core, plain = fit_both("SurfelMap2D", 0.05, *together(end_points(seed)))
     p = np.random.default_rng(seed).uniform(0.0, 1.0, plain.size).astype(np.float32)
     of_core, of_plain = order(core), order(plain)
     p_of_core = np.empty_like(p)
@@ -51,26 +39,22 @@ def test_a_wall_supports_itself_and_nothing_beside_it():
     x = np.arange(-1.5, 1.5, 0.05) + 0.025
     wall = np.column_stack([x, np.full_like(x, 0.025)])
     alone = np.array([[0.025, 0.625]])  # the only one there
-    surfels = surfel_map(_core, np.concatenate([wall, alone]))
+    surfels = fit_surfels(_core, "SurfelMap2D", 0.05, *together([*wall, *alone]))
     found = _core.line_support(surfels, np.ones(surfels.size, np.float32), **LINES)
     cells = surfels.surfels()[0]
     on_wall = cells[:, 1] == 0
     middle = on_wall & (cells[:, 0] == 0)
     assert found[middle] == 2 * (20 - 2)  # both directions, without the gap
     assert found[~on_wall] <= 6  # where a line crosses the wall
-
-
-def test_what_is_dynamic_supports_nothing():
-    surfels = surfel_map(_core, end_points(3))
+    # what is dynamic supports nothing
     none = _core.line_support(surfels, np.zeros(surfels.size, np.float32), **LINES)
     assert not none.any()
 
 
 def test_threads_change_nothing():
     rng = np.random.default_rng(4)
-    surfels = surfel_map(_core, rng.uniform(-9.0, 9.0, (60000, 2)))
+    ends = together(rng.uniform(-9.0, 9.0, (60000, 2)))
+    surfels = fit_surfels(_core, "SurfelMap2D", 0.05, *ends)
     assert surfels.size > 20000  # enough for threads to be used
     p = rng.uniform(0.0, 1.0, surfels.size).astype(np.float32)
-    once = _core.line_support(surfels, p, **LINES)
-    for threads in (2, 3):
-        assert _core.line_support(surfels, p, **LINES, threads=threads).tobytes() == once.tobytes()
+    assert_same_bits(lambda n: [_core.line_support(surfels, p, **LINES, threads=n)], 2, 3)

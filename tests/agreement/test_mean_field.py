@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import reference
 from marks import slow_params
-from surfel_maps import fit_both, order
+from surfel_maps import assert_same_bits, fit_both, fit_surfels, order, together
 
 from stillmap import _core
 from stillmap.em.spatial_coupling import _MEAN_FIELD as MEAN_FIELD
@@ -43,56 +43,25 @@ def test_threads_change_nothing():
     ends = rng.uniform(-9, 9, (60000, 3)).astype(np.float32)
     T = np.tile(np.eye(4), (100, 1, 1))
     offset, look = np.arange(0, 60001, 600), np.arange(100)
-    surface = _core.SurfelMap3D(0.4)
-    surface.add_end_points(ends, np.ones(60000, bool), offset, T, look)
-    surface.fit()
+    beams = ends, np.ones(60000, bool), offset, T, look
+    surface = fit_surfels(_core, "SurfelMap3D", 0.4, *beams)
     assert surface.size > 20000  # enough for threads to be used
     own = rng.normal(1.0, 2.0, surface.size).astype(np.float32)
-    once = _core.smooth_mean_field(surface, own, **MEAN_FIELD)
-    for threads in (2, 3):
-        assert (
-            _core.smooth_mean_field(surface, own, **MEAN_FIELD, threads=threads).tobytes()
-            == once.tobytes()
-        )
-
-
-def car_beside_wall(at_car, at_wall):
-    """The side of a car of 3 m before a wall; each hit in the given looks, in every cell.
-
-    Returns the surface and which elements are of the car; element i is in column x.
-    """
-    surface = _core.SurfelMap3D(0.2)
-    x, z = (a.ravel() for a in np.meshgrid(np.arange(15) * 0.2 + 0.1, np.arange(8) * 0.2 + 0.1))
-    for y, looks in ((2.1, at_car), (4.1, at_wall)):
-        ends = np.column_stack([x, np.full_like(x, y), z]).astype(np.float32)
-        for look in looks:
-            one = np.array([look])
-            surface.add_end_points(
-                ends, np.ones(len(ends), bool), np.array([0, len(ends)]), np.eye(4)[None], one
-            )
-    surface.fit()
-    cells = surface.surfels()[0]
-    return surface, cells[:, 1] == 10, cells[:, 0]
+    assert_same_bits(
+        lambda n: [_core.smooth_mean_field(surface, own, **MEAN_FIELD, threads=n)], 2, 3
+    )
 
 
 def test_disjoint_time_spans_do_not_interact():
-    # the same, but the rest was hit before the mover came
-    surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
-    other = _core.SurfelMap3D(0.2)
-    cells = surface.surfels()[0]
-    for early in (False, True):
-        of = (car & (x >= 4)) if early else (car & (x < 4))
-        ends = ((cells[of] + 0.5) * 0.2).astype(np.float32)
-        for look in [0, 4] if early else [5, 6, 7]:
-            other.add_end_points(
-                ends,
-                np.ones(len(ends), bool),
-                np.array([0, len(ends)]),
-                np.eye(4)[None],
-                np.array([look]),
-            )
-    other.fit()
-    x = other.surfels()[0][:, 0]
-    own = np.where(x < 4, -4.0, 1.5).astype(np.float32)
-    p = _core.smooth_mean_field(other, own, **MEAN_FIELD)
-    np.testing.assert_array_equal(p > 0.5, x >= 4)
+    """A car of 3 m side by side with what was hit before it came."""
+    surface = _core.SurfelMap3D(0.2)
+    x, z = (a.ravel() for a in np.meshgrid(np.arange(15) * 0.2 + 0.1, np.arange(8) * 0.2 + 0.1))
+    ends = np.column_stack([x, np.full_like(x, 2.1), z])
+    for of, looks in ((x < 0.8, (5, 6, 7)), (x >= 0.8, (0, 4))):
+        for look in looks:
+            surface.add_end_points(*together(ends[of]), np.array([look]))
+    surface.fit()
+    column = surface.surfels()[0][:, 0]
+    own = np.where(column < 4, -4.0, 1.5).astype(np.float32)
+    p = _core.smooth_mean_field(surface, own, **MEAN_FIELD)
+    np.testing.assert_array_equal(p > 0.5, column >= 4)

@@ -9,7 +9,7 @@ import pytest
 import reference
 from reference.observation import HIT, SURE
 from scipy.special import ndtr
-from surfel_maps import fit_both, order
+from surfel_maps import fit_both, order, together
 
 from stillmap import _core
 from stillmap.em.observations import HmmClasses
@@ -161,10 +161,7 @@ def test_observations(room, changes):
             found.append(reliability(hmm)[order(surface)])
         core, plain = found
         np.testing.assert_array_equal(core == HIT, plain == HIT)
-        # values near the thresholds may be on either side of them
-        edge = (np.abs(plain - SURE) < 0.012) | (plain < 0.03) & (core < 0.03)
-        sure = (plain == 1.0) & (core > SURE - 0.012)
-        np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
+        assert_same_reliability(core, plain)
         hits += (plain == HIT).sum()
         seen += (plain == 1.0).sum()
         partly += ((plain > 0.05) & (plain < 0.9)).sum()
@@ -199,6 +196,13 @@ def test_count_no_return_beams(room, swallowed):
     assert 20 < through - few_through < more
 
 
+def assert_same_reliability(core, plain):
+    """Values near the thresholds may be on either side of them."""
+    edge = (np.abs(plain - SURE) < 0.012) | (np.abs(plain) < 0.03) & (np.abs(core) < 0.03)
+    sure = (plain == 1.0) & (core > SURE - 0.012)
+    np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
+
+
 @pytest.mark.parametrize("trusted", [0.0, 0.4, 1.0])
 def test_trust_beyond_solid(room, swallowed, trusted):
     points, hit, offset, T = swallowed.scans(4, 14)
@@ -212,9 +216,7 @@ def test_trust_beyond_solid(room, swallowed, trusted):
             hmm.add(points, hit, offset, T, np.full(10, 7))
             found[kernels, how] = reliability(hmm)[order(surface)]
     core, plain, all_the_way = found[_core, trusted], found[reference, trusted], found[_core, 1.0]
-    edge = (np.abs(plain - SURE) < 0.012) | (np.abs(plain) < 0.03) & (np.abs(core) < 0.03)
-    sure = (plain == 1.0) & (core > SURE - 0.012)
-    np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
+    assert_same_reliability(core, plain)
     assert (all_the_way - core >= -1e-9).all()
     assert ((all_the_way - core).max() > 0.05) == (trusted < 1.0)
 
@@ -269,12 +271,8 @@ def test_threads_and_chunks_give_the_same_bits(room, threads, cuts):
     whole = room.hmm(_core, surface, *CLASSES, 0.97)
     whole.add(*room.beams.arguments, room.time_bin)
     pieces = room.hmm(_core, surface, *CLASSES, 0.97)
-    bounds = [
-        0,
-        *(int(np.searchsorted(room.time_bin, room.time_bin[c])) for c in cuts),
-        len(room.time_bin),
-    ]
-    for first, last in pairwise(bounds):  # time bins stay whole
+    whole_bins = np.searchsorted(room.time_bin, room.time_bin[cuts]).tolist()
+    for first, last in pairwise([0, *whole_bins, len(room.time_bin)]):
         pieces.add(*room.scans(first, last), room.time_bin[first:last], threads)
     for a, b in zip(whole.likelihood(), pieces.likelihood(), strict=True):
         assert a.tobytes() == b.tobytes()
@@ -282,34 +280,25 @@ def test_threads_and_chunks_give_the_same_bits(room, threads, cuts):
 
 def test_short_runs_are_not_observed():
     # runs of two beams without a return are skipped, runs of three within a scan are used
-    surface = _core.SurfelMap2D(0.1), reference.SurfelMap2D(0.1)
-    T = np.tile(np.eye(3), (2, 1, 1))
-    end, none = np.array([[1.05, 0.05]], np.float32), np.array([[4, 0.2]], np.float32)
-    for s in surface:
-        s.add_end_points(end, np.ones(1, bool), np.array([0, 1]), T[:1])
-        s.fit()
-    seen = {}
-    for name, hits, offset in (
-        ("two", [1, 0, 0, 1], [0, 4, 4]),
-        ("three", [1, 0, 0, 0, 1], [0, 5, 5]),
-        ("three at the end", [1, 1, 0, 0, 0], [0, 5, 5]),
-        ("cut", [0, 0, 0], [0, 2, 3]),
-        ("next to what is not usable", [0, 0, 0, 0], [0, 4, 4]),
+    surfaces = fit_both("SurfelMap2D", 0.1, *together([[1.05, 0.05]]))
+    T, none = np.tile(np.eye(3), (2, 1, 1)), np.array([[4, 0.2]], np.float32)
+    for hits, cut, unusable, expected in (
+        ([1, 0, 0, 1], 4, None, False),
+        ([1, 0, 0, 0, 1], 5, None, True),
+        ([1, 1, 0, 0, 0], 5, None, True),
+        ([0, 0, 0], 2, None, False),
+        ([0, 0, 0, 0], 4, 2, False),
     ):
-        hit = np.array(hits, bool)
+        hit, offset = np.array(hits, bool), np.array([0, cut, len(hits)])
         points = np.where(hit[:, None], np.float32([-1, 0]), none).astype(np.float32)
-        if "usable" in name:
-            points[2] = np.nan
-        for kernels, s in zip((_core, reference), surface, strict=True):
-            hmm = kernels.OccupancyHmm2D(
-                s, rho=[0.5], tau=[1.0], p_detection=0.5, bin_seconds=1.0,
-                lateral_std=0.01, margin=0.1, hit_radius=0.05, end_margin=0.3,
-            )  # fmt: skip
-            hmm.add(points, hit, np.array(offset), T, np.array([3, 3]))
-            seen.setdefault(name, []).append(bool(reliability(hmm)[0]))
-    expected = {"two": False, "three": True, "three at the end": True, "cut": False}
-    expected["next to what is not usable"] = False
-    assert seen == {name: [says, says] for name, says in expected.items()}
+        if unusable is not None:
+            points[unusable] = np.nan
+        for kernels, s in zip((_core, reference), surfaces, strict=True):
+            lengths = {"lateral_std": 0.01, "margin": 0.1, "hit_radius": 0.05, "end_margin": 0.3}
+            model = {"rho": [0.5], "tau": [1.0], "p_detection": 0.5, "bin_seconds": 1.0}
+            hmm = kernels.OccupancyHmm2D(s, **model, **lengths)
+            hmm.add(points, hit, offset, T, np.array([3, 3]))
+            assert bool(reliability(hmm)[0]) == expected, hits
 
 
 def test_normal_distribution_function():

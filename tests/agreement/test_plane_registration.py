@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import reference
+from surfel_maps import assert_same_bits
 
 from stillmap import _core
 from stillmap.core import se3
 
 PLANE = {"min_weight": 4.0, "max_flatness": 0.2, "min_extent": 0.02}
 FIT = {**PLANE, "range_std": 0.03, "kernel_width": 3.0}
+STEPS = {"information_scale": 0.5, "start_slack": 0.1, "max_iterations": 6, "tolerance": 1e-4}
 
 
 def cloud(seed, n=1500):
@@ -69,40 +71,21 @@ def test_register_sweep(maps):
     points, weights, times = cloud(9, 600)
     prior, twist = pose(10, 0.03), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.4])
     information = np.diag([100.0] * 3 + [400.0] * 3 + [10.0] * 6)
-    steps = {
-        "information_scale": 0.5,
-        "start_level": 2,
-        "start_slack": 0.1,
-        "max_iterations": 6,
-        "tolerance": 1e-4,
-    }
-    last = {_core: {"threads": 2}, reference: {}}
-    core, plain = (
-        k.register_sweep(
-            m, points, weights, times, prior, twist, information, **FIT, **steps, **last[k]
-        )
-        for k, m in zip((_core, reference), maps, strict=True)
-    )
+    asked = points, weights, times, prior, twist, information
+    core = _core.register_sweep(maps[0], *asked, **FIT, **STEPS, start_level=2, threads=2)
+    plain = reference.register_sweep(maps[1], *asked, **FIT, **STEPS, start_level=2)
     for found, expected in zip(core[:3], plain, strict=False):
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
     assert np.linalg.norm(core[0][:3, 3] - prior[:3, 3]) > 0.005
 
 
 def test_any_number_of_threads_gives_the_same_bits(maps):
-    points, weights, times = cloud(9, 5000)
-    information = np.eye(12)
+    asked = *cloud(9, 5000), pose(10, 0.03), np.zeros(6), np.eye(12)
 
     def found(threads):
-        return _core.register_sweep(
-            maps[0], points, weights, times, pose(10, 0.03), np.zeros(6), information,
-            **FIT, information_scale=0.5, start_level=1, start_slack=0.1, max_iterations=10,
-            tolerance=1e-4, threads=threads,
-        )  # fmt: skip
+        return _core.register_sweep(maps[0], *asked, **FIT, **STEPS, start_level=1, threads=threads)
 
-    one = found(1)
-    for threads in (2, 3, 8):
-        for a, b in zip(one, found(threads), strict=True):
-            assert np.array_equal(a, b)
+    assert_same_bits(found, 2, 3, 8)
 
 
 def test_transform_by_twist_and_voxel_downsample():

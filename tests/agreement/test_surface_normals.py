@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 from reference import surface_normals
+from surfel_maps import together
 
 from stillmap import _core
 from stillmap.slam.scan_hits import make_scan
 
 OPTIONS = {"radius": 0.3, "max_gap": 1.0, "flat_below": 0.1, "round_from": 0.4}
-FIELD = {"sigma": 0.04, "radius": 2, "floor": 0.05, "unknown": 0.2}
+FIELD = {"sigma": 0.04, "radius": 2, "floor": 0.05, "unknown": 0.2, "information_scale": 0.2}
 SEARCH = {"search_range": 20.0, "max_candidates": 1, "max_iterations": 20}
-WINDOW = {"window_translation": 0.0, "window_rotation": 0.0}
+SEARCH |= {"window_translation": 0.0, "window_rotation": 0.0}
 
 
 def scans(seed):
@@ -65,23 +66,24 @@ def corridor():
     return np.concatenate([np.stack([y, np.full(200, s)], axis=-1) for s in (-1.0, 1.0)])
 
 
-def covariance_of(points, prior_std, normals=None):
+def covariance_of(points, normals):
     """Covariance of a scan at its true place in a map that the same end points make."""
-    grid = _core.OccupancyGrid2D(0.05)
-    one, e = np.array([0, len(points)]), np.ones(len(points), np.float32)
-    _core.add_beams(grid, points, np.ones(len(points), bool), e, one, np.eye(3)[None])
-    information = np.diag(np.full(3, prior_std**-2))
-    return _core.register_scan(
-        grid, points, e, np.eye(3), information, **FIELD, information_scale=0.2,
-        **SEARCH, **WINDOW, T_start=np.eye(3), **(normals or {}),
-    )[1]  # fmt: skip
+    grid, e = _core.OccupancyGrid2D(0.05), np.ones(len(points), np.float32)
+    points, hit, offset, T = together(points)
+    _core.add_beams(grid, points, hit, e, offset, T)
+    prior = np.eye(3), np.diag(np.full(3, 4.0)), np.eye(3)
+    options = {**FIELD, **SEARCH, **normals, "T_start": prior[2]}
+    return _core.register_scan(grid, points, e, *prior[:2], **options)[1]
+
+
+def normals_of(points):
+    found = make_scan(points, np.ones(len(points), np.float32), np.eye(3))
+    return {"normals": found.normals, "isotropy": found.isotropy}
 
 
 def test_a_bare_corridor_says_nothing_along_it():
     points = corridor().astype(np.float32)
-    found = make_scan(points, np.ones(len(points), np.float32), np.eye(3))
-    known = {"normals": found.normals, "isotropy": found.isotropy}
-    by_normals, by_curvature = covariance_of(points, 0.5, known), covariance_of(points, 0.5)
+    by_normals, by_curvature = covariance_of(points, normals_of(points)), covariance_of(points, {})
     assert np.sqrt(by_normals[0, 0]) == pytest.approx(0.5, rel=0.02)
     assert np.sqrt(by_normals[1, 1]) < 0.02
     assert np.sqrt(by_curvature[0, 0]) < 0.1  # what the pattern of the end points pretends
@@ -90,11 +92,10 @@ def test_a_bare_corridor_says_nothing_along_it():
 def test_covariance_agrees_with_the_twin():
     points = np.concatenate([corridor(), [[6.0, y] for y in np.linspace(-1, 1, 40)]])
     points = points.astype(np.float32)
-    found = make_scan(points, np.ones(len(points), np.float32), np.eye(3))
-    known = {"normals": found.normals, "isotropy": found.isotropy}
-    C = covariance_of(points, 0.5, known)
+    known = normals_of(points)
+    C = covariance_of(points, known)
     of_all = surface_normals.surface_information(
-        points.astype(float), np.ones(len(points)), found.normals, found.isotropy, np.eye(3)
+        points.astype(float), np.ones(len(points)), *known.values(), np.eye(3)
     )
     # the same information, but for the share of each beam that the field explains
     measured = np.linalg.inv(C) - np.diag(np.full(3, 4.0))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from reference.observation import HIT
 from reference.occupancy_hmm import chain_log_likelihood
+from surfel_maps import fit_surfels
 
 from stillmap import _core
 from stillmap.em.observations import HmmClasses
@@ -19,7 +20,6 @@ def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):
 
     The sensor is at x = `at` in each time bin and looks along x.
     """
-    surface = _core.SurfelMap2D(0.1)
     offset = np.array([0, 3])  # shorter runs without a return would be skipped
     yes, no = np.ones(3, bool), np.zeros(3, bool)
 
@@ -29,12 +29,10 @@ def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):
         return np.array([[end - x, 0]] * 3, np.float32), T
 
     ends, T = beams(0.0, 1.05)
-    surface.add_end_points(ends, yes, offset, T)
-    surface.fit()
-    hmm = _core.OccupancyHmm2D(
-        surface, rho=rho, tau=tau, view_angle=turn, p_detection=detection, bin_seconds=seconds,
-        lateral_std=0.01, margin=0.1, hit_radius=0.05, end_margin=0.3,
-    )  # fmt: skip
+    surface = fit_surfels(_core, "SurfelMap2D", 0.1, ends, yes, offset, T)
+    model = {"rho": rho, "tau": tau, "view_angle": turn, "p_detection": detection}
+    lengths = {"lateral_std": 0.01, "margin": 0.1, "hit_radius": 0.05, "end_margin": 0.3}
+    hmm = _core.OccupancyHmm2D(surface, bin_seconds=seconds, **model, **lengths)
     for (n, hit), x in zip(seen, [0.0] * len(seen) if at is None else at, strict=True):
         points, T = beams(x, 1.05 if hit else 4)
         hmm.add(points, yes if hit else no, offset, T, np.array([n]))

@@ -1,27 +1,16 @@
 """A place as `stillmap merge` would write it, made from the truth of simulated sessions."""
 
 import json
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from place_cells import CELL, collect_cells
-from place_truth import SessionTruth
 
 from stillmap.core import se2
 from stillmap.io.stillmap_folder import read
 from stillmap.io.trajectory import write_tum
 
-Float = NDArray[np.float64]
 
-
-def write_place(
-    folder: Path,
-    truth: SessionTruth,
-    shifts: dict[int, Float] | None = None,
-    refused: tuple[int, ...] = (),
-    made_up: bool = True,
-) -> None:
+def write_place(folder, truth, shifts=None, refused=(), made_up=True):
     """Write a perfect place, whose frame is the start of the first accepted session.
 
     Args:
@@ -54,7 +43,7 @@ def write_place(
         write_map(folder, truth, accepted, T_place_world)
 
 
-def write_changes(folder: Path, truth: SessionTruth, T_place_world: Float) -> None:
+def write_changes(folder, truth, T_place_world):
     """The true changes; boxes turn with the frame of the place."""
     changes = []
     for number, change in enumerate(truth.changes):
@@ -67,14 +56,14 @@ def write_changes(folder: Path, truth: SessionTruth, T_place_world: Float) -> No
     (folder / "changes.json").write_text(json.dumps(changes))
 
 
-def turn_box(box: tuple[float, ...], T: Float) -> list[float]:
+def turn_box(box, T):
     """The box around a box in another frame."""
     corners = np.array([(box[i], box[j]) for i in (0, 2) for j in (1, 3)])
     moved = corners @ T[:2, :2].T + T[:2, 2]
     return [*moved.min(axis=0).tolist(), *moved.max(axis=0).tolist()]
 
 
-def write_map(folder: Path, truth: SessionTruth, accepted: list[int], T_place_world: Float) -> None:
+def write_map(folder, truth, accepted, T_place_world):
     """A map of what stands there in the last session, wherever any session looked.
 
     Its lattice is that of the world, so its origin is turned.

@@ -25,12 +25,12 @@ class Found(NamedTuple):
     stamp_ns: int
 
 
-def stay(x: float, y: float, since: float | None, until: float | None, mover: int = 0) -> Stay:
+def stay(x, y, since, until, mover=0):
     ends = [None if t is None else round(t * S) for t in (since, until)]
     return Stay(mover, np.array([x, y]), np.array(box(x, y, 0.2, 0.4)), *ends)
 
 
-def looks(stays: list[Stay], seconds: list[float], wall: float = 4.0) -> Beams:
+def looks(stays, seconds, wall=4.0):
     """Scans from x = 0 along rows of cells, straight to the east: to a thing, or to the wall."""
     y = np.arange(0.05, 4.0, R)
     start, end, mover, scan = [], [], [], []
@@ -54,7 +54,7 @@ def looks(stays: list[Stay], seconds: list[float], wall: float = 4.0) -> Beams:
     )
 
 
-def grid_with(cells: list[tuple[int, int]], origin=(0.0, 0.0, 0.0)) -> Grid:
+def grid_with(cells, origin=(0.0, 0.0, 0.0)):
     p = np.full((42, 42), 0.1)
     for row, column in cells:
         p[row, column] = 0.9

@@ -7,7 +7,7 @@ import pytest
 from change_scores import list_true_changes
 from changes import COLUMNS, beams_of, scores_of, stays_of
 
-from stillmap.sim import Simulation, scene_by_name, simulate
+from stillmap.sim import scene_by_name, simulate
 
 # whole simulations are scored
 pytestmark = pytest.mark.slow
@@ -16,12 +16,12 @@ SHORT = {"robot": {"scans": 1000}}
 
 
 @pytest.fixture(scope="module")
-def street() -> Simulation:
+def street():
     """Until all cars that leave or come have done so, and most of that was seen."""
     return simulate(scene_by_name("street-moved", SHORT), 0)
 
 
-def test_stays_are_those_of_the_things(street: Simulation) -> None:
+def test_stays_are_those_of_the_things(street):
     stays = stays_of(street)
     kinds = street.truth.scene["mover_kinds"]
     assert {kinds[stay.mover] for stay in stays} == {"thing"}
@@ -37,7 +37,7 @@ def test_stays_are_those_of_the_things(street: Simulation) -> None:
     assert {c.appeared for c in list_true_changes(stays, beams)} == {False, True}
 
 
-def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
+def perfect(simulation, state):
     """A result at true poses, with a map made by hand and changes that are all right."""
     truth, beams, stays = simulation.truth, beams_of(simulation), stays_of(simulation)
     resolution, low = 0.05, beams.end.min(axis=0) - 1.0
@@ -64,7 +64,7 @@ def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
     )
 
 
-def test_what_is_right_scores_full_marks(street: Simulation) -> None:
+def test_what_is_right_scores_full_marks(street):
     scores = scores_of(perfect(street, "last"), street)
     assert {column.key for column in COLUMNS} == set(scores)
     assert (scores["new_kept"], scores["old_occupied"]) == (1.0, 0.0)

@@ -2,13 +2,7 @@
 
 import numpy as np
 import pytest
-from model_objects import (
-    Model,
-    MoverHits,
-    Track,
-    match_mover,
-    score_object_models,
-)
+from model_objects import Model, MoverHits, Track, match_mover, score_object_models
 from model_surface import (
     GREY,
     NOTHING,
@@ -19,13 +13,10 @@ from model_surface import (
     sample_surface,
     score_surface,
 )
-from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
 from stillmap.sim.camera import SKY
 from stillmap.sim.geometry import BOX, Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
-
-Float = NDArray[np.float64]
 
 NONE = Solids(
     np.empty((1, 0, 4)),
@@ -49,7 +40,7 @@ T_WORLD_MAP = np.array([[0.0, -1, 0, 2], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0
 T_MAP_WORLD = np.linalg.inv(T_WORLD_MAP)
 
 
-def _floor(x: tuple[float, float], y: tuple[float, float], z: float = 0.0, n: int = 10):
+def _floor(x, y, z=0.0, n=10):
     """A square of the floor in the map frame, upwards."""
     u, v = (m.ravel() for m in np.meshgrid(np.linspace(*x, n + 1), np.linspace(*y, n + 1)))
     world = np.stack([u, v, np.full(len(u), z)], axis=1)
@@ -60,7 +51,7 @@ def _floor(x: tuple[float, float], y: tuple[float, float], z: float = 0.0, n: in
     return world @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3], faces.astype(np.int32)
 
 
-def _pictures(mask: NDArray[np.uint16], off: float = 0.0) -> TrueImages:
+def _pictures(mask, off=0.0):
     v, u = np.mgrid[:30, :40]
     rays = np.stack([(u - 19.5) / 30, (v - 14.5) / 30, np.ones(u.shape)])
     distance = (3.0 * np.linalg.norm(rays, axis=0) + off).astype(np.float32)
@@ -69,13 +60,13 @@ def _pictures(mask: NDArray[np.uint16], off: float = 0.0) -> TrueImages:
     )
 
 
-def _record(vertices: Float, faces: NDArray[np.int32]) -> TextureRecord:
+def _record(vertices, faces):
     image = np.zeros(len(faces), np.int32)
     return TextureRecord(vertices, faces, image, (np.linalg.inv(DOWN) @ T_WORLD_MAP)[None])
 
 
 @pytest.mark.parametrize("up", [0.0, 0.03, -0.03, 0.07])
-def test_a_shifted_surface_is_off_by_its_shift(up: float) -> None:
+def test_a_shifted_surface_is_off_by_its_shift(up):
     vertices, faces = _floor((-2, 2), (-2, 2), up)
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-1.9, 1.9, (500, 2)), np.zeros(500)])
@@ -86,7 +77,7 @@ def test_a_shifted_surface_is_off_by_its_shift(up: float) -> None:
     assert found.places == 500
 
 
-def test_a_surface_with_holes_is_less_complete() -> None:
+def test_a_surface_with_holes_is_less_complete():
     vertices, faces = _floor((-2, 0), (-2, 2))
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-2, 2, (20_000, 2)), np.zeros(20_000)])
@@ -95,7 +86,7 @@ def test_a_surface_with_holes_is_less_complete() -> None:
     assert found.complete == pytest.approx((2.0 + 0.05) / 4.0, abs=0.01)
 
 
-def test_texture_shows_what_the_pictures_do() -> None:
+def test_texture_shows_what_the_pictures_do():
     mask = np.zeros((30, 40), np.uint16)
     mask[:, :10], mask[:, 30:35] = 5, SKY  # a quarter and an eighth of what the picture shows
     record = _record(*_floor((-2, 2), (-1.5, 1.5)))
@@ -132,12 +123,12 @@ _SIDES = np.array(
 )  # fmt: skip
 
 
-def _box(grown: float) -> Float:
+def _box(grown):
     """The corners of a box larger than that by so much on every side, about its foot."""
     return _CUBE * (1.0 + grown, 0.5 + grown, 0.5 + grown) + (0, 0, 0.5)
 
 
-def _seen_box() -> MoverHits:
+def _seen_box():
     """Beams all over its left side, at 0.5 s."""
     rng = np.random.default_rng(1)
     local = np.column_stack([rng.uniform(-1, 1, 500), np.full(500, 0.5), rng.uniform(0, 1, 500)])
@@ -147,7 +138,7 @@ def _seen_box() -> MoverHits:
 
 
 @pytest.mark.parametrize("grown", [0.0, 0.03, 0.08])
-def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
+def test_a_model_that_is_too_large_is_off_by_that(grown):
     T = np.eye(4)
     T[0, 3] = 2.0  # where it is at 2 s
     model = Model(_box(grown), _SIDES, T_MAP_WORLD @ T, 2 * 10**9, (0, 10**9), None)
@@ -166,7 +157,7 @@ def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
     assert np.isnan(found.background)
 
 
-def test_background_on_a_mover_is_told() -> None:
+def test_background_on_a_mover_is_told():
     mask = np.full((30, 40), 1, np.uint16)  # mover 0
     mask[:, :20] = 0
     corners = np.array([(-1.0, -0.5, 1.0), (1, -0.5, 1), (1, 0.5, 1), (-1, 0.5, 1)])
@@ -187,7 +178,7 @@ def test_background_on_a_mover_is_told() -> None:
     assert found.models[0].textured == 1.0
 
 
-def test_a_model_is_of_whom_the_track_was_on_then() -> None:
+def test_a_model_is_of_whom_the_track_was_on_then():
     stamps = np.array([0, 10**9, 2 * 10**9, 3 * 10**9])
     movers = np.zeros((4, 2, 3))
     movers[:, 1, 0] = 5.0
@@ -206,7 +197,7 @@ SQUARE = (
 )
 
 
-def test_distances_to_corners_edges_and_inside() -> None:
+def test_distances_to_corners_edges_and_inside():
     points = np.array([(1.0, 0.5, 0.3), (-0.3, 0.5, 0.4), (2.3, 1.4, 0.0), (0.5, 0.5, 0.0)])
     distances = distance_to_mesh(points, *SQUARE, 0.1)
     assert np.allclose(distances, [0.3, 0.5, 0.5, 0.0])

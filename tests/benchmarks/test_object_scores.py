@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-from object_scores import (
-    compute_true_flow_map,
-    find_sightings,
-    score_objects,
-)
+from object_scores import compute_true_flow_map, find_sightings, score_objects
 
 from stillmap.tracking import MovingObject
 

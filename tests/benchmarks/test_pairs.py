@@ -5,13 +5,13 @@ from pairs import errors_of, near_pairs
 from stillmap.core import se2
 
 
-def line(T: int) -> np.ndarray:
+def line(T):
     """A metre a second along x, and back."""
     x = np.concatenate([np.arange(T), np.arange(T)[::-1]]).astype(float)
     return se2.matrix(x, np.zeros(2 * T), np.repeat([0.0, np.pi], T))
 
 
-def test_pairs_are_near_in_space_and_anywhere_in_time() -> None:
+def test_pairs_are_near_in_space_and_anywhere_in_time():
     positions = line(100)[:, :2, 2]
     first, second = near_pairs(positions, np.random.default_rng(0), 3000, 5.0)
     assert len(first) == 3000
@@ -23,7 +23,7 @@ def test_pairs_are_near_in_space_and_anywhere_in_time() -> None:
     np.testing.assert_array_equal((first, second), again)
 
 
-def test_errors_are_those_of_the_displacements() -> None:
+def test_errors_are_those_of_the_displacements():
     truth, stamp_ns = line(50), 10**18 + np.arange(100) * 10**8
     pairs = near_pairs(truth[:, :2, 2], np.random.default_rng(0), 200)
     elsewhere = se2.matrix(3.0, -2.0, 1.0) @ truth

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_up_place import write_place
-from place_changes import ChangeScores
-from place_scores import PlaceScores, score_place
-from place_truth import SessionTruth, load_session_truth
+from place_scores import score_place
+from place_truth import load_session_truth
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
@@ -23,7 +22,7 @@ QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2
 
 
 @pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
+def truth(tmp_path_factory):
     """Three sessions of a corridor with six rooms."""
     folder = tmp_path_factory.mktemp("sessions") / "days"
     plan = plan_sessions(scene_by_name("lookalike-1", QUICK), 3, 5)
@@ -32,29 +31,29 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
 
 
 @pytest.fixture(scope="module")
-def perfect(truth: SessionTruth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def perfect(truth, tmp_path_factory):
     folder = tmp_path_factory.mktemp("place") / "perfect"
     write_place(folder, truth)
     return folder
 
 
 @pytest.fixture
-def place(perfect: Path, tmp_path: Path) -> Path:
+def place(perfect, tmp_path):
     """A perfect one, to be spoilt."""
     return Path(shutil.copytree(perfect, tmp_path / "place"))
 
 
-def changes_of(scores: PlaceScores) -> ChangeScores:
+def changes_of(scores):
     assert scores.changes is not None
     return scores.changes
 
 
-def edit_changes(place: Path, edit) -> None:
+def edit_changes(place, edit):
     path = place / "changes.json"
     path.write_text(json.dumps(edit(json.loads(path.read_text()))))
 
 
-def test_a_perfect_place_is_perfect(perfect: Path, truth: SessionTruth) -> None:
+def test_a_perfect_place_is_perfect(perfect, truth):
     scores = score_place(perfect, truth.folder)
     assert (scores.right, scores.wrong, scores.refused) == (3, 0, 0)
     for one in scores.sessions:
@@ -86,7 +85,7 @@ def test_a_perfect_place_is_perfect(perfect: Path, truth: SessionTruth) -> None:
         ((0.0, 0.0, np.pi), "wrong"),
     ],
 )
-def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) -> None:
+def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict):
     write_place(tmp_path / "place", truth, {1: se2.matrix(*shift)}, made_up=False)
     for name in ("changes.json", "map.npz"):
         shutil.copy(perfect / name, tmp_path / "place" / name)
@@ -102,7 +101,7 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
         assert one.median_seam == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
 
 
-def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
+def test_sessions_of_another_place_must_be_refused(tmp_path):
     scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
     plans = [plan_sessions(scene, 1, k) for k, scene in enumerate(scenes)]
     write_sessions(plans, tmp_path / "days")
@@ -115,7 +114,7 @@ def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
     assert [one.verdict for one in refused.sessions] == ["right", "refused rightly"]
 
 
-def test_changes_that_were_not_found_cost_recall(place: Path, truth: SessionTruth) -> None:
+def test_changes_that_were_not_found_cost_recall(place, truth):
     edit_changes(place, lambda changes: changes[:0])
     changes = changes_of(score_place(place, truth.folder))
     assert changes.recall == 0.0
@@ -123,7 +122,7 @@ def test_changes_that_were_not_found_cost_recall(place: Path, truth: SessionTrut
     assert (changes.found, changes.events_found, changes.changes) == (0, 0, 0)
 
 
-def test_changes_of_another_date_are_neither_found_nor_right(place, truth) -> None:
+def test_changes_of_another_date_are_neither_found_nor_right(place, truth):
     names = list(truth.names)
 
     def later(changes):
@@ -138,7 +137,7 @@ def test_changes_of_another_date_are_neither_found_nor_right(place, truth) -> No
     assert changes.f1 < 0.8
 
 
-def test_ghosts_and_missing_walls_show_in_the_map(place: Path, truth: SessionTruth) -> None:
+def test_ghosts_and_missing_walls_show_in_the_map(place, truth):
     with np.load(place / "map.npz") as file:
         arrays = dict(file)
     p = arrays["p_occupied"]
@@ -161,7 +160,7 @@ def test_ghosts_and_missing_walls_show_in_the_map(place: Path, truth: SessionTru
         ("changes.json", '{"kind": "gone"}', "is damaged"),
     ],
 )
-def test_damaged_places_are_refused(place, truth, file, text, error) -> None:
+def test_damaged_places_are_refused(place, truth, file, text, error):
     (place / file).write_text(text)
     with pytest.raises(InputError, match=error):
         score_place(place, truth.folder)

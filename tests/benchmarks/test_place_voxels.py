@@ -4,9 +4,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from place_changes import ChangeScores, FoundChange, score_changes
-from place_truth import SessionTruth, load_session_truth
-from place_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
+from place_changes import FoundChange, score_changes
+from place_truth import load_session_truth
+from place_voxels import VOXEL, Voxels, collect_voxels
 
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import draw_piece, plan_sessions, write_sessions
@@ -19,7 +19,7 @@ SESSIONS = [0, 1, 2]
 
 
 @pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
+def truth(tmp_path_factory):
     """Three sessions of a piece of a street."""
     folder = tmp_path_factory.mktemp("sessions") / "days"
     routes = [partial(draw_piece, begin=begin) for begin in (40.0, 40.0, 42.0)]
@@ -29,11 +29,11 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
 
 
 @pytest.fixture(scope="module")
-def cells(truth: SessionTruth) -> VoxelTruth:
+def cells(truth):
     return collect_voxels(truth, SESSIONS, np.empty((0, 3)))
 
 
-def true_changes(truth: SessionTruth, cells: VoxelTruth) -> list[FoundChange]:
+def true_changes(truth, cells):
     found = []
     for change in truth.changes:
         left, came = (cells.draw_object(truth, change.object, k) for k in change.between)
@@ -41,11 +41,11 @@ def true_changes(truth: SessionTruth, cells: VoxelTruth) -> list[FoundChange]:
     return found
 
 
-def score(found: list[FoundChange], truth: SessionTruth, cells: VoxelTruth) -> ChangeScores:
+def score(found, truth, cells):
     return score_changes(found, "cells", cells, truth, SESSIONS)
 
 
-def test_true_changes_score_perfectly(truth: SessionTruth, cells: VoxelTruth) -> None:
+def test_true_changes_score_perfectly(truth, cells):
     scores = score(true_changes(truth, cells), truth, cells)
     assert scores.cells > 30
     assert scores.f1 > 0.98
@@ -54,13 +54,13 @@ def test_true_changes_score_perfectly(truth: SessionTruth, cells: VoxelTruth) ->
     assert scores.dates_right == 1.0
 
 
-def test_nothing_found_is_no_recall(truth: SessionTruth, cells: VoxelTruth) -> None:
+def test_nothing_found_is_no_recall(truth, cells):
     scores = score([], truth, cells)
     assert scores.recall == 0.0
     assert scores.events_found == 0
 
 
-def test_changes_of_another_place_are_spurious(truth: SessionTruth, cells: VoxelTruth) -> None:
+def test_changes_of_another_place_are_spurious(truth, cells):
     wrong = [
         one._replace(came=one.left & False, left=cells.fixed) for one in true_changes(truth, cells)
     ]
@@ -69,7 +69,7 @@ def test_changes_of_another_place_are_spurious(truth: SessionTruth, cells: Voxel
     assert scores.spurious > 0
 
 
-def test_voxels_are_found_by_their_points_and_have_26_neighbours() -> None:
+def test_voxels_are_found_by_their_points_and_have_26_neighbours():
     steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3), axis=-1).reshape(-1, 3)
     centre = np.array([-3.1, 5.3, -0.1])
     voxels = Voxels(centre + VOXEL * steps)

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from cases import Case
 from common import scores
-from prepared import Prepared, counts, prepare, without_people
+from prepared import counts, prepare, without_people
 
 from stillmap import em
 
 
 @pytest.fixture(scope="module")
-def run() -> Prepared:
+def run():
     changes = {"robot": {"scans": 150}, "crowd": {"people": 25}}
     return prepare(Case("office", "", "office", changes), 3)
 
 
-def test_true_labels_at_true_poses_score_full_marks(run: Prepared) -> None:
+def test_true_labels_at_true_poses_score_full_marks(run):
     recording, truth = run.simulation.recording, run.simulation.truth
     labels = truth.static.astype(np.float32)
     grid = counts(recording, recording.points, recording.hit, labels, truth.T_world_base)
@@ -27,7 +27,7 @@ def test_true_labels_at_true_poses_score_full_marks(run: Prepared) -> None:
     assert found["called_dynamic"] == found["dynamic"] > 0.01
 
 
-def test_what_ended_on_doors_is_left_out_of_the_scores_without_them(run: Prepared) -> None:
+def test_what_ended_on_doors_is_left_out_of_the_scores_without_them(run):
     recording, truth = run.simulation.recording, run.simulation.truth
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
     door = kinds == "door"
@@ -48,7 +48,7 @@ def test_what_ended_on_doors_is_left_out_of_the_scores_without_them(run: Prepare
     assert scored[1]["ece_unsure_no_doors"] == scored[1]["ece_unsure"] == pytest.approx(0.9)
 
 
-def test_without_people_only_what_they_hid_differs(run: Prepared) -> None:
+def test_without_people_only_what_they_hid_differs(run):
     sim = run.simulation
     points, hit, static = without_people(sim, np.random.default_rng(0))
     kinds = np.array([*sim.truth.scene["mover_kinds"], "none"])[sim.truth.mover]

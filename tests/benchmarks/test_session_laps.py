@@ -7,7 +7,7 @@ from session_laps import find_laps, select_scans
 import stillmap
 
 
-def recording_of(scans: int) -> stillmap.Recording:
+def recording_of(scans):
     ranges = 1.0 + np.arange(scans)[:, None] + np.array([0.0, 0.25, 0.5])
     odometry = np.column_stack([np.arange(scans), np.zeros(scans), np.zeros(scans)])
     return stillmap.Recording.from_scans(

@@ -11,7 +11,7 @@ QUICK = {"laser": {"beams": 90}, "robot": {"scans": 150}, "crowd": {"people": 3}
 
 
 @pytest.mark.slow
-def test_wings_share_a_door_only() -> None:
+def test_wings_share_a_door_only():
     made = [*simulate_sessions(plan_wings(1, QUICK))]
     sights = [observe(session.recording, session.truth) for session in made]
     assert compute_overlap(sights, [0, 0])[0, 1] < 0.1
@@ -20,12 +20,12 @@ def test_wings_share_a_door_only() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("overlap", OVERLAPS, ids=lambda overlap: overlap.name)
-def test_pairs_overlap_as_wanted(overlap) -> None:
+def test_pairs_overlap_as_wanted(overlap):
     plan = plan_pair(scene_by_name("office"), overlap, 3)
     assert overlap.low <= measure_overlap(plan, with_people=True) < overlap.high
 
 
-def test_robots_stay_in_their_regions() -> None:
+def test_robots_stay_in_their_regions():
     regions = ((0.0, 0.0, 18.0, 25.0), (22.0, 0.0, 40.0, 25.0))
     routes = [stay_within(region) for region in regions]
     plan = plan_sessions(scene_by_name("office", QUICK), 2, 4, routes=routes)

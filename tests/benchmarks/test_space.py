@@ -1,7 +1,5 @@
 """What labels in space are scored with, and that all methods get the same beams in turn."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import space_cases
@@ -13,7 +11,7 @@ from stillmap.sim.truth import Truth
 NAN = float("nan")
 
 
-def test_accuracies_by_hand() -> None:
+def test_accuracies_by_hand():
     static = np.array([True, True, True, True, False, False])
     p_static = np.array([0.9, 0.5, NAN, 0.1, 0.1, 0.9])
     # 3 of 4 static ones stay, 1 of 2 dynamic ones goes: 2 * 75 * 50 / 125
@@ -24,14 +22,14 @@ def test_accuracies_by_hand() -> None:
     assert np.isnan([nobody["da"], nobody["ha"]]).all()
 
 
-def test_accuracies_of_a_published_row() -> None:
+def test_accuracies_of_a_published_row():
     # BeautyMap on sequence 00 of KITTI: SA 96.9529, DA 98.3382, HA 97.6407
     static = np.repeat([True, False], 1_000_000)
     p_static = np.concatenate([np.arange(1_000_000) < 969_529, np.arange(1_000_000) >= 983_382])
     assert accuracies(p_static.astype(float), static)["ha"] == pytest.approx(97.6407, abs=1e-4)
 
 
-def test_scores_by_kind_leave_out_what_nobody_knows() -> None:
+def test_scores_by_kind_leave_out_what_nobody_knows():
     known = Known(
         static=np.array([True, True, False, False, False, False]),
         kind=np.array([2, 2, 0, 0, 1, 2], np.int16),
@@ -52,7 +50,7 @@ def test_scores_by_kind_leave_out_what_nobody_knows() -> None:
     assert "ap" not in scores(np.ones(6), known, certain=True)
 
 
-def test_labels_of_files(tmp_path: Path) -> None:
+def test_labels_of_files(tmp_path):
     instance = 7 << 16
     np.array([252 | instance, 9], np.uint32).tofile(tmp_path / "000000.label")
     np.array([0, 252], np.uint32).tofile(tmp_path / "000001.label")
@@ -62,7 +60,7 @@ def test_labels_of_files(tmp_path: Path) -> None:
     assert [known.kinds[k] for k in known.kind[known.scored]] == ["moving", "static", "moving"]
 
 
-def test_who_is_met_at_rest_only() -> None:
+def test_who_is_met_at_rest_only():
     movers = np.zeros((4, 4, 3))
     movers[:, 0, 0] = [0.0, 3.0, 3.1, 3.2]  # met once he stands
     movers[:, 1, 0] = [0.0, 0.0, 0.0, 5.0]  # met before and after

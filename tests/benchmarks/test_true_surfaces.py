@@ -21,7 +21,7 @@ from stillmap.sim.geometry import (
 STREET = Ground(np.zeros(2), np.array([[2.0, -9.0, 9.0, 9.0]]), 0.12)
 
 
-def _solid(form: int, half: tuple[float, float], z: tuple[float, float]) -> Solids:
+def _solid(form, half, z):
     pose = np.array([[[1.0, -2.0, 0.7, 0.3]]])
     mover = np.zeros(1, np.int32)
     return Solids(pose, np.array([form], np.int8), np.array([half]), np.array([z]), mover)
@@ -37,9 +37,7 @@ def _solid(form: int, half: tuple[float, float], z: tuple[float, float]) -> Soli
         (ELLIPSOID, (0.1, 0.08), (1.4, 1.7)),
     ],
 )
-def test_nearest_places_of_solids(
-    form: int, half: tuple[float, float], z: tuple[float, float]
-) -> None:
+def test_nearest_places_of_solids(form, half, z):
     solids = _solid(form, half, z)
     meshes = {BOX: creation.box((2, 2, 2)), CYLINDER: creation.cylinder(1, 2, sections=256)}
     mesh = meshes.get(form) or creation.icosphere(subdivisions=5)
@@ -63,7 +61,7 @@ def test_nearest_places_of_solids(
     assert np.allclose(again, found, atol=1e-7)
 
 
-def test_nearest_places_of_faces_and_ground() -> None:
+def test_nearest_places_of_faces_and_ground():
     wall = Faces(np.array([[0.0, 0.0, 0.0, 4.0]]), np.array([[-0.5, 2.5]]), np.zeros(1, bool))
     none = _solid(BOX, (1.0, 1.0), (0.0, 1.0)).select(np.zeros(1, bool))
     points = np.array(
@@ -85,7 +83,7 @@ def test_nearest_places_of_faces_and_ground() -> None:
     )
 
 
-def test_movers_go_on_evenly_between_scans_but_for_leaps() -> None:
+def test_movers_go_on_evenly_between_scans_but_for_leaps():
     pose = np.zeros((3, 2, 4))
     pose[:, 0, 0] = [0.0, 1.0, 2.0]
     pose[:, 0, 2] = [3.1, -3.1, -3.0]  # round past the back

@@ -14,7 +14,7 @@ OUTSIDE = re.compile(r"\s*(?:[a-z]+:)?//", re.IGNORECASE)
 class Resources(HTMLParser):
     """Addresses that a browser fetches by itself: scripts, styles, images, fonts, frames."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.addresses: list[str] = []
 

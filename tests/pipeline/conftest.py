@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.sim import Scene, Simulation, simulate
+from stillmap.sim import Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 
 @functools.cache
-def _room(scans: int, max_range: float) -> Simulation:
+def _room(scans, max_range):
     scene = Scene(
         "room",
         walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
@@ -28,7 +28,7 @@ def _room(scans: int, max_range: float) -> Simulation:
 
 
 @pytest.fixture
-def room() -> Simulation:
+def room():
     """60 scans of 120 beams, three people, some beams at maximum range."""
     simulation = _room(60, 7.0)
     assert 0 < (~simulation.recording.hit).sum() < 0.2 * simulation.recording.n_beams
@@ -37,6 +37,6 @@ def room() -> Simulation:
 
 
 @pytest.fixture
-def short() -> Simulation:
+def short():
     """The same with 6 scans."""
     return _room(6, 7.0)

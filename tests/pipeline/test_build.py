@@ -10,7 +10,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import stillmap
 from stillmap import em
-from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.tracking.motion_evidence import apply_motion_evidence
 
@@ -49,7 +48,7 @@ def expected_labels(recording, poses, alpha, beta, origin, resolution, prior):
     return e
 
 
-def with_unusable(recording: Recording) -> Recording:
+def with_unusable(recording):
     points, hit = recording.points.copy(), recording.hit.copy()
     points[100:110], hit[100:110] = np.nan, False
     return dataclasses.replace(recording, points=points, hit=hit)

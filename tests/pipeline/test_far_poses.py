@@ -165,7 +165,7 @@ def test_a_trajectory_that_was_written_is_read_again(room, tmp_path):
     np.testing.assert_allclose(result.poses, poses, rtol=0, atol=1e-8)
 
 
-def test_absurd_poses_are_refused(room: object, tmp_path) -> None:
+def test_absurd_poses_are_refused(room, tmp_path):
     recording: Recording = room.recording  # type: ignore[attr-defined]
     poses = shift(room.truth.T_world_base, 1e10 * np.ones(3))  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match=r"(?s)poses: expected numbers below 1e\+09, got .* at 0"):

@@ -10,7 +10,7 @@ import stillmap
 from stillmap.core import se2
 from stillmap.io import read
 from stillmap.prepare.options import ReadOptions
-from stillmap.sim import Simulation, scene_by_name, simulate
+from stillmap.sim import scene_by_name, simulate
 
 TURNED = math.radians(20.0)
 FRONT = {"x": 0.25, "y": -0.15, "yaw": TURNED}
@@ -26,7 +26,7 @@ NO_RETURN = 81.83
 
 
 @functools.cache
-def hall(mounted: tuple[tuple[str, float], ...]) -> Simulation:
+def hall(mounted):
     """The first 12 m of a populated hall; the same way and people wherever the laser sits."""
     # an odd number of beams: mirrored they point the same ways
     laser = {"beams": 181, "x": 0.0, "y": 0.0, "yaw": 0.0, **dict(mounted)}

@@ -1,7 +1,6 @@
 """Recordings that do not fit into memory: the same result, a piece at a time."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ def swept(room):
     return dataclasses.replace(recording, beam_time=times)
 
 
-def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
+def files_of(recording, estimator, out):
     """All that a run writes, but for what tells of time and memory."""
     options = override(
         stillmap.Options(),

@@ -54,7 +54,7 @@ def build(monkeypatch, short):
     return run
 
 
-def made_up(recording, number, bound, changed_share, **more) -> Iteration:
+def made_up(recording, number, bound, changed_share, **more):
     """Everything in it tells its number."""
     T = recording.n_scans
     poses = np.tile(se2.matrix(0.01 * number, 0, 0), (T, 1, 1))

@@ -5,29 +5,25 @@ import math
 import numpy as np
 import pytest
 from marks import slow_params
-from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.em.options import EmOptions
 from stillmap.prepare.floor_detection import find_floor_returns
-from stillmap.sim import Scene, Simulation, scene_by_name, simulate
+from stillmap.sim import Scene, scene_by_name, simulate
 from stillmap.sim.planar import FLOOR
 from stillmap.sim.walls import box
 
-Bool = NDArray[np.bool_]
 
-
-def drive(name: str, seed: int = 0, **changes: dict[str, object]) -> Simulation:
+def drive(name, seed=0, **changes):
     usual: dict[str, dict[str, object]] = {"robot": {"scans": 250}, "crowd": {"people": 8}}
     sections = {**usual, **{k: {**usual.get(k, {}), **v} for k, v in changes.items()}}
     return simulate(scene_by_name(name, sections), seed)
 
 
-def find(run: Simulation) -> Bool:
+def find(run):
     odometry = run.recording.T_odom_base
-    assert odometry is not None
     return find_floor_returns(run.recording, odometry)
 
 
@@ -47,9 +43,7 @@ POOR = {"translation_noise": 0.03, "rotation_noise": 0.06, "drift_noise": 0.024}
         *slow_params(*((seed, {"beams": 181}, {}) for seed in range(5, 9))),
     ],
 )
-def test_most_floor_is_found_and_little_else(
-    seed: int, laser: dict[str, object], robot: dict[str, object]
-) -> None:
+def test_most_floor_is_found_and_little_else(seed, laser, robot):
     run = drive("hall", seed, laser=laser, robot={**ROUGH, **robot}, odometry=POOR)
     found, floor = find(run), run.truth.mover == FLOOR
     assert floor.sum() > 300
@@ -58,7 +52,7 @@ def test_most_floor_is_found_and_little_else(
     assert run.truth.static[found].mean() < 0.03
 
 
-def to_and_fro(speed: float, seed: int, **changes: dict[str, object]) -> Simulation:
+def to_and_fro(speed, seed, **changes):
     """A robot that drives at the walls of a bare room."""
     route = ((-8.0, 0.0), (8.5, 0.0), (-8.5, 0.3), (8.5, 0.5), (0.0, 3.5), (0.0, -3.5))
     scene = Scene(name="room", walls=tuple(box(0, 0, 20, 10)), route=route)
@@ -69,16 +63,15 @@ def to_and_fro(speed: float, seed: int, **changes: dict[str, object]) -> Simulat
 
 @pytest.mark.parametrize("speed", [0.3, 1.0, 2.5])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wall_that_the_robot_approaches_is_not_floor(speed: float, seed: int) -> None:
+def test_a_wall_that_the_robot_approaches_is_not_floor(speed, seed):
     scans = find(to_and_fro(speed, seed)).reshape(300, -1).any(axis=1)
     # fast turns with poor odometry before a bare wall may mislead in one of 300 scans
     assert np.count_nonzero(scans) <= (1 if speed > 2.0 else 0)
 
 
-def test_wrong_odometry_makes_no_floor_of_walls() -> None:
+def test_wrong_odometry_makes_no_floor_of_walls():
     run, rng = to_and_fro(1.0, 0), np.random.default_rng(0)
     odometry = run.recording.T_odom_base
-    assert odometry is not None
     n_found = 0
     for scan in rng.choice(300, 40, replace=False):
         off = se2.matrix(*rng.normal(0.0, (0.4, 0.4, 0.15)))
@@ -92,7 +85,7 @@ def test_wrong_odometry_makes_no_floor_of_walls() -> None:
     assert n_found <= 1e-4 * 40 * run.recording.n_beams
 
 
-def test_floor_starts_with_a_low_p_static() -> None:
+def test_floor_starts_with_a_low_p_static():
     run = drive("hall", robot=ROUGH)
     floor = run.truth.mover == FLOOR
     options = EmOptions()

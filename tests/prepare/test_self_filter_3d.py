@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from marks import slow_params
 
-from stillmap.core.recording import Recording
 from stillmap.prepare import self_filter
-from stillmap.sim import Simulation, scene_by_name, simulate
+from stillmap.sim import scene_by_name, simulate
 
 pytestmark = pytest.mark.slow
 
@@ -17,19 +16,19 @@ LOW = {"z": 0.7, "low": -0.6, "high": 0.3}  # the lidar of a small robot
 SMALL = {**LOW, "sees_robot": True, "roof_length": 0.6, "roof_width": 0.5, "roof_below": 0.2}
 
 
-def run(world: str, scans: int, seed: int = 0, speed: float | None = None, **lidar) -> Simulation:
+def run(world, scans, seed=0, speed=None, **lidar):
     robot = {"scans": scans} if speed is None else {"scans": scans, "speed": speed}
     options = {"channels": 32, "columns": 200, **lidar}
     return simulate(scene_by_name(world, {"lidar": options, "robot": robot}), seed)
 
 
 @pytest.fixture(scope="module")
-def drive() -> Simulation:
+def drive():
     """A car that sees its own roof."""
     return run("street", 90, **CAR)
 
 
-def gone(recording: Recording) -> np.ndarray:
+def gone(recording):
     """Hits that are left out."""
     out = self_filter.remove_self_returns(recording)
     lost = recording.hit & ~out.hit

@@ -1,13 +1,13 @@
 """The sums of (10), the E-step (6), (8), and the log likelihoods (4), (5), (7)."""
 
-from collections.abc import Iterator
+# ruff: noqa: ARG001  (threads: as the kernels have it)
+
 from dataclasses import dataclass
 from math import isfinite, isnan, log
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from reference.occupancy_grid import Cell, OccupancyGrid
 from reference.ray_traversal import cell_of, traverse
 
 Float = NDArray[np.float64]
@@ -26,9 +26,7 @@ class Beam:
     end: Float
 
 
-def usable_beams(
-    dimension: int, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
-) -> Iterator[Beam]:
+def usable_beams(dimension, points, hit, offset, T_map_sensor):
     """The beams whose points are finite, in order, with both ends in the map frame."""
     z, struck = np.asarray(points, float), np.asarray(hit, bool)
     bounds, T = np.asarray(offset, np.int64), np.asarray(T_map_sensor, float)
@@ -49,39 +47,31 @@ def usable_beams(
                 yield Beam(t, n, bool(struck[n]), origin, R @ z[n] + origin)
 
 
-def passed_cells(grid: OccupancyGrid, beam: Beam) -> Iterator[tuple[Cell, float]]:
+def passed_cells(grid, beam):
     """Cells before the end cell with their l_j."""
     cells, lengths = traverse(beam.start, beam.end, grid.resolution)
     for cell, length in zip(cells[:-1], lengths[:-1], strict=True):
         yield tuple(cell.tolist()), float(length)
 
 
-def _end_cell(grid: OccupancyGrid, beam: Beam) -> Cell:
+def _end_cell(grid, beam):
     return tuple(cell_of(beam.end, grid.resolution).tolist())
 
 
-def _checked_prior(prior: float) -> float:
+def _checked_prior(prior):
     if not 0 <= prior <= 1:
         raise ValueError(f"prior: expected a probability in [0, 1], got {prior}")
     return prior
 
 
-def per_beam(e: ArrayLike, points: ArrayLike) -> Float:
+def per_beam(e, points):
     values = np.asarray(e, float)
     if values.shape != (len(np.asarray(points)),):
         raise ValueError(f"e: expected one value for each of points, got shape {values.shape}")
     return values
 
 
-def add_beams(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    e: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> None:
+def add_beams(grid, points, hit, e, offset, T_map_sensor, threads=1):
     """Add the sums alpha_j and beta_j below (10) of these beams to `grid`.
 
     The cells before the end cell get the chord length l_j as beta, whatever e is. The end cell of
@@ -103,16 +93,7 @@ def add_beams(
     add_end_points(grid, points, hit, e, offset, T_map_sensor)
 
 
-def add_end_points(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    e: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    *,
-    remove: bool = False,
-) -> None:
+def add_end_points(grid, points, hit, e, offset, T_map_sensor, *, remove=False):
     """Add or remove the sums of the end cells, the part of `add_beams` that depends on e.
 
     Args: see `add_beams`.
@@ -127,15 +108,7 @@ def add_end_points(
             grid.add(end, sign * static, sign * (1.0 - static), beam.end)
 
 
-def e_step(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    prior: float,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> NDArray[np.float32]:
+def e_step(grid, points, hit, offset, T_map_sensor, prior, threads=1):
     """Equations (6), (8): (M,) the expectation e of c for each beam, given the map.
 
     p m / (p m + (1 - p)(1 - m)) with m of the end cell. The prior p is kept for maximum-range
@@ -151,16 +124,7 @@ def e_step(
     return e.astype(np.float32)
 
 
-def log_likelihood(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    e: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    prior: float,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> Float:
+def log_likelihood(grid, points, hit, e, offset, T_map_sensor, prior, threads=1):
     """The terms of the expected log likelihood (5) per scan, in nats.
 
     Inside logarithms m and 1 - m are floored at 1e-12, so that the cost of a beam that contradicts
@@ -188,7 +152,7 @@ def log_likelihood(
     return terms
 
 
-def _expected_log(e: float, m: float) -> float:
+def _expected_log(e, m):
     """e ln m + (1 - e) ln(1 - m) with 0 ln 0 = 0."""
     weighted = ((e, m), (1.0 - e, 1.0 - m))
     return sum(w * log(max(x, PROBABILITY_FLOOR)) for w, x in weighted if w > 0)

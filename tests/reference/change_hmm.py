@@ -1,14 +1,11 @@
 """Change HMM: a three-state Markov chain (object, empty, passer-by) per cell."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import exp, log
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
 Bins = tuple[int, int]
 
 OBJECT, EMPTY, PASSER_BY = range(3)
@@ -32,12 +29,12 @@ class ChangeModel:
     p_detection: float
 
     @property
-    def prior(self) -> Float:
+    def prior(self):
         """(3,) stationary distribution."""
         rho = self.passer_by_rho
         return np.array([0.5, 0.5 * (1.0 - rho), 0.5 * rho])
 
-    def transition(self, dt: float) -> Float:
+    def transition(self, dt):
         """(3, 3) from, to. Where an object leaves, passers-by are stationary."""
         rho = self.passer_by_rho
         stays = 0.5 + 0.5 * exp(-dt / self.tau)
@@ -50,7 +47,7 @@ class ChangeModel:
         p[1:, 1:] = stays * passing
         return p
 
-    def likelihood(self, reliability: float | None) -> Float:
+    def likelihood(self, reliability):
         """(3,) likelihood of a hit (None), or of a miss of some reliability."""
         if reliability is None:
             return np.array([self.p_detection, 0.0, self.p_detection])
@@ -78,9 +75,7 @@ class ChangeSummary:
     change_bins: tuple[tuple[Bins, Bins], tuple[Bins, Bins]]
 
 
-def summarise_changes(
-    observations: Sequence[tuple[int, float | None]], seconds: float, model: ChangeModel
-) -> ChangeSummary:
+def summarise_changes(observations, seconds, model):
     """Forward algorithm and Viterbi path over all observations.
 
     Args:
@@ -117,17 +112,17 @@ def summarise_changes(
     )
 
 
-def _changes(there: Sequence[bool], numbers: Sequence[int]) -> list[Bins]:
+def _changes(there, numbers):
     return [
         (numbers[k - 1], numbers[k]) for k in range(1, len(numbers)) if there[k] != there[k - 1]
     ]
 
 
-def _ends(turns: list[Bins]) -> tuple[Bins, Bins]:
+def _ends(turns):
     return (turns[0], turns[-1]) if turns else (NO_CHANGE, NO_CHANGE)
 
 
-def _share(there: Sequence[bool], numbers: Sequence[int]) -> float:
+def _share(there, numbers):
     if len(numbers) < 2:
         return float(there[-1])
     halves = [0.5 * (a + b) for a, b in pairwise(there)]

@@ -1,11 +1,12 @@
 """Cluster pooling per sweep, and relabelling of beams that end on the ground below movers."""
 
+# ruff: noqa: ARG001, ARG002  (threads: as the kernels have it)
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from reference.beam_counting import usable_beams
 from reference.ray_traversal import cell_of
-from reference.surfel_map import SurfelMap
 
 Float = NDArray[np.float64]
 Column = tuple[int, int]
@@ -24,28 +25,13 @@ class ClusterPooling3D:
         min_surfels: smaller clusters are ignored.
     """
 
-    def __init__(
-        self,
-        surfel_map: SurfelMap,
-        is_obstacle: ArrayLike,
-        values: ArrayLike,
-        *,
-        column_cells: int,
-        min_surfels: int,
-    ) -> None:
+    def __init__(self, surfel_map, is_obstacle, values, *, column_cells, min_surfels):
         self.surfel_map, self.column_cells, self.min_surfels = surfel_map, column_cells, min_surfels
         self.is_obstacle = np.asarray(is_obstacle, bool)
         self.values = np.asarray(values, float)
         self.means_of: list[list[Float]] = [[] for _ in range(surfel_map.size)]
 
-    def add(
-        self,
-        points: ArrayLike,
-        hit: ArrayLike,
-        offset: ArrayLike,
-        T_map_sensor: ArrayLike,
-        threads: int = 1,  # noqa: ARG002  signature of the kernel
-    ) -> None:
+    def add(self, points, hit, offset, T_map_sensor, threads=1):
         """Add scans; each of them is clustered by itself."""
         number = self.surfel_map.index_of_cell()
         of_scan: dict[int, set[int]] = {}
@@ -61,12 +47,12 @@ class ClusterPooling3D:
                     for k in cluster:
                         self.means_of[k].append(mean)
 
-    def means(self) -> Float:
+    def means(self):
         """(E, K) cluster means of each surfel, averaged over sweeps; NaN: in no cluster."""
         unknown = np.full(self.values.shape[1], np.nan)
         return np.array([np.mean(one, axis=0) if one else unknown for one in self.means_of])
 
-    def _clusters(self, surfels: set[int]) -> list[list[int]]:
+    def _clusters(self, surfels):
         """Connected components of columns, 8-neighbourhood."""
         columns: dict[Column, list[int]] = {}
         for k in surfels:
@@ -89,22 +75,22 @@ class ClusterPooling3D:
 
 
 def relabel_ground_contact(
-    surfel_map: SurfelMap,
-    points: ArrayLike,
-    hit: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    surfel: ArrayLike,
+    surfel_map,
+    points,
+    hit,
+    offset,
+    T_map_sensor,
+    surfel,
     *,
-    is_obstacle: ArrayLike,
-    p_static: ArrayLike,
-    ground_height: ArrayLike,
-    at_any_height: ArrayLike,
-    column_cells: int,
-    max_ground_height: float,
-    min_end_height: float,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> Float:
+    is_obstacle,
+    p_static,
+    ground_height,
+    at_any_height,
+    column_cells,
+    max_ground_height,
+    min_end_height,
+    threads=1,
+):
     """(M,) mean P(static) of the dynamic column above each beam that ends on the ground.
 
     Args:
@@ -145,7 +131,7 @@ def relabel_ground_contact(
     return out
 
 
-def _height(surfel_map: SurfelMap, k: int, end: Float, ground: float) -> float:
+def _height(surfel_map, k, end, ground):
     """Metres above the plane of a level surfel, else above the ground."""
     plane = surfel_map.fitted[k].plane
     if plane is not None and abs(plane.normal[2]) > LEVEL:

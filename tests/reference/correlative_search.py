@@ -5,10 +5,9 @@ from itertools import product
 from math import ceil, log
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from reference.likelihood_field import retract
-from reference.occupancy_grid import OccupancyGrid
 from reference.ray_traversal import cell_of
 
 Float = NDArray[np.float64]
@@ -31,7 +30,7 @@ class Raster:
     values: Int
     unit: float
 
-    def at(self, pixels: Int) -> Int:
+    def at(self, pixels):
         """(...) values of pixels (..., 2)."""
         index = pixels - self.first
         inside = np.asarray(((index >= 0) & (index < self.values.shape)).all(axis=-1))
@@ -39,7 +38,7 @@ class Raster:
         return np.where(inside, found, 0)
 
 
-def raster(grid: OccupancyGrid, cells: int, sigma: float, floor: float) -> Raster:
+def raster(grid, cells, sigma, floor):
     """The raster of a map in pixels `cells` wide.
 
     A cell k contributes m_k exp(-|d|^2 / (2 s^2)), d between the centres of cell and pixel and
@@ -82,7 +81,7 @@ class Lattice:
     angle_step: float
     scores: Float
 
-    def index_of(self, T: ArrayLike) -> tuple[Float, tuple[int, ...]]:
+    def index_of(self, T):
         """How far a pose (3, 3) is from the nearest one of the lattice, in steps; its index."""
         pose = np.asarray(T, float)
         turn = pose[:2, :2] @ self.T_prior[:2, :2].T
@@ -94,19 +93,19 @@ class Lattice:
 
 
 def search_lattice(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    weights: ArrayLike,
-    T_prior: ArrayLike,
-    information: ArrayLike,
+    grid,
+    points,
+    weights,
+    T_prior,
+    information,
     *,
-    sigma: float,
-    floor: float,
-    information_scale: float,
-    window_translation: float,
-    window_rotation: float,
-    search_range: float,
-) -> Lattice:
+    sigma,
+    floor,
+    information_scale,
+    window_translation,
+    window_rotation,
+    search_range,
+):
     """The score of every pose in a window around the prior.
 
     information_scale sum_n w_n r(pixel of T p_n) - 1/2 d^T Lambda d, with the raster r and the

@@ -1,11 +1,10 @@
 """EM with fixed poses: the loop of Fig. 2 without its registration."""
 
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 import reference  # the package itself: its names are looked up when called
 
@@ -20,15 +19,7 @@ class EmStep:
     bound: float  # nats, with the new e: ln p(z | x, m)
 
 
-def m_step_map(
-    points: ArrayLike,
-    hit: ArrayLike,
-    e: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    resolution: float,
-    kernels: ModuleType | None = None,
-) -> Any:
+def m_step_map(points, hit, e, offset, T_map_sensor, resolution, kernels=None):
     """Equations (10) to (15) for fixed poses: the grid whose m_j maximises (5)."""
     k = kernels or reference
     grid = (
@@ -38,16 +29,7 @@ def m_step_map(
     return grid
 
 
-def em_fixed_poses(
-    points: ArrayLike,
-    hit: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    prior: float,
-    resolution: float,
-    iterations: int,
-    kernels: ModuleType | None = None,
-) -> list[EmStep]:
+def em_fixed_poses(points, hit, offset, T_map_sensor, prior, resolution, iterations, kernels=None):
     """Fig. 2 with given poses: e := p, then M-step and E-step in turn.
 
     Args:

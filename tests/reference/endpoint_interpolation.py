@@ -1,28 +1,16 @@
 """Interpolation of end points between neighbouring beams on one flat surface."""
 
-from collections.abc import Iterator
 from math import ceil
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from reference.beam_counting import Beam, per_beam, usable_beams
-from reference.occupancy_grid import OccupancyGrid
+from reference.beam_counting import per_beam, usable_beams
 from reference.ray_traversal import cell_of
 
 
 def interpolate_end_points(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    e: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    *,
-    max_gap: float,
-    tolerance: float,
-    max_gap_ratio: float,
-) -> None:
+    grid, points, hit, e, offset, T_map_sensor, *, max_gap, tolerance, max_gap_ratio
+):
     """Interpolate end points between neighbouring beams on one flat surface.
 
     Two neighbouring hits of one scan are on one surface if they are collinear with the hit before
@@ -61,7 +49,7 @@ def interpolate_end_points(
                 grid.add(cell, float(both.min()), 0.0, end)
 
 
-def _neighbours(hits: list[Beam]) -> Iterator[tuple[Beam, Beam, list[Beam]]]:
+def _neighbours(hits):
     """Pairs of adjacent hits in one scan, and the hits before and after them."""
     numbered = {(beam.scan, beam.number): beam for beam in hits}
     for (scan, n), a in numbered.items():
@@ -71,9 +59,7 @@ def _neighbours(hits: list[Beam]) -> Iterator[tuple[Beam, Beam, list[Beam]]]:
             yield a, b, [other for other in around if other is not None]
 
 
-def _is_collinear(
-    a: Beam, b: Beam, other: Beam, max_gap: float, tolerance: float, max_gap_ratio: float
-) -> bool:
+def _is_collinear(a, b, other, max_gap, tolerance, max_gap_ratio):
     """Whether `other`, the nearer of a and b, and the farther one are collinear."""
     near, far = (a, b) if other.number < a.number else (b, a)
     before, step = near.end - other.end, far.end - near.end

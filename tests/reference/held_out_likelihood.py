@@ -1,16 +1,15 @@
 """The density of held-out ranges given the labels of the other beams."""
 
+# ruff: noqa: ARG001  (threads: as the kernels have it)
+
 from functools import partial
 from math import erfc, exp, inf, log, log1p, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from reference.beam_counting import Beam, usable_beams
-from reference.occupancy_grid import Cell, OccupancyGrid
+from reference.beam_counting import usable_beams
+from reference.occupancy_grid import OccupancyGrid
 from reference.ray_traversal import cell_of, traverse
-
-Float = NDArray[np.float64]
 
 
 class StaticFractionGrid:
@@ -21,39 +20,31 @@ class StaticFractionGrid:
         dimension: 2 or 3.
     """
 
-    def __init__(self, resolution: float, dimension: int) -> None:
+    def __init__(self, resolution, dimension):
         self.cells = OccupancyGrid(resolution, dimension)  # alpha: sum of e, beta: sum of 1 - e
         self.length = 0.0
 
     @property
-    def resolution(self) -> float:
+    def resolution(self):
         return self.cells.resolution
 
     @property
-    def end_rate(self) -> float:
+    def end_rate(self):
         """Beam ends per metre, with one end in one metre added."""
         hits = sum(self.cells.alpha.values()) + sum(self.cells.beta.values())
         return (hits + 1.0) / (self.length + 1.0)
 
     @property
-    def dynamic_rate(self) -> float:
+    def dynamic_rate(self):
         """Beam ends on moving objects per metre, with one end in one metre added."""
         return (sum(self.cells.beta.values()) + 1.0) / (self.length + 1.0)
 
-    def share(self, cell: Cell) -> float:
+    def share(self, cell):
         """Mean e of the hits in a cell, 0 where there are none."""
         m = self.cells.occupancy_of(cell)
         return 0.0 if np.isnan(m) else m
 
-    def add(
-        self,
-        points: ArrayLike,
-        hit: ArrayLike,
-        e: ArrayLike,
-        offset: ArrayLike,
-        T_map_sensor: ArrayLike,
-        is_held_out: ArrayLike,
-    ) -> None:
+    def add(self, points, hit, e, offset, T_map_sensor, is_held_out):
         """Add the beams of the scans that are not held out (T,)."""
         expectation, held_out = np.asarray(e, float), np.asarray(is_held_out, bool)
         for beam in usable_beams(self.cells.dimension, points, hit, offset, T_map_sensor):
@@ -71,20 +62,20 @@ StaticFractionGrid3D = partial(StaticFractionGrid, dimension=3)
 
 
 def score_held_out(
-    fractions: StaticFractionGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    is_held_out: ArrayLike,
+    fractions,
+    points,
+    hit,
+    offset,
+    T_map_sensor,
+    is_held_out,
     *,
-    stopping_rate: float,
-    range_std: float,
-    late_share: float,
-    mean_delay: float,
-    outlier_share: float,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> Float:
+    stopping_rate,
+    range_std,
+    late_share,
+    mean_delay,
+    outlier_share,
+    threads=1,
+):
     """Sums per scan of ln p(z) - ln q(z) over its beams, and number of beams.
 
     Args:
@@ -117,15 +108,7 @@ def score_held_out(
     return out
 
 
-def _log_density(
-    fractions: StaticFractionGrid,
-    beam: Beam,
-    z: float,
-    stopping_rate: float,
-    range_std: float,
-    late_share: float,
-    mean_delay: float,
-) -> float:
+def _log_density(fractions, beam, z, stopping_rate, range_std, late_share, mean_delay):
     """Log density of a return at z, or log probability of no return."""
     behind = beam.end + (beam.end - beam.start) * (5.0 * range_std / z if beam.hit else 0.0)
     cells, lengths = traverse(beam.start, behind, fractions.resolution)
@@ -149,9 +132,9 @@ def _log_density(
     return log(density) if density > 0.0 else -inf
 
 
-def _normal(x: float) -> float:
+def _normal(x):
     return 0.5 * erfc(-x / sqrt(2.0))
 
 
-def _exponential(x: float) -> float:
+def _exponential(x):
     return 1.0 - exp(-x) if x > 0.0 else 0.0

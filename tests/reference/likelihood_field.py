@@ -4,15 +4,14 @@ from itertools import product
 from math import erf, exp, isnan, log, pi, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from reference.occupancy_grid import OccupancyGrid
 from reference.ray_traversal import cell_of
 
 Float = NDArray[np.float64]
 
 
-def smoothed_occupancy(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: int) -> float:
+def smoothed_occupancy(grid, y, sigma, radius):
     """F(y): smoothed occupancy at a point, about 1 on a straight, fully occupied wall.
 
     The sum over cells k within `radius` cells of that of y (largest coordinate difference) of
@@ -41,7 +40,7 @@ def smoothed_occupancy(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: 
     return total / (sqrt(2 * pi) * sigma / grid.resolution)
 
 
-def _around(grid: OccupancyGrid, centre: NDArray[np.int64], radius: int) -> tuple[Float, Float]:
+def _around(grid, centre, radius):
     """Means (K, 2) of the end points in the neighbouring cells, and their occupancies (K,)."""
     means, m = [], []
     for step in product(range(-radius, radius + 1), repeat=2):
@@ -53,7 +52,7 @@ def _around(grid: OccupancyGrid, centre: NDArray[np.int64], radius: int) -> tupl
     return np.array(means).reshape(-1, 2), np.array(m)
 
 
-def _line(means: Float, m: Float) -> tuple[Float, Float, bool]:
+def _line(means, m):
     """Centroid (2,) and normal (2,) of weighted points, and whether they lie on a line."""
     weights = m / m.sum()
     mean = weights @ means
@@ -62,14 +61,7 @@ def _line(means: Float, m: Float) -> tuple[Float, Float, bool]:
     return mean, axes[:, 0], bool(variance[0] < 0.1 * variance[1])
 
 
-def ends_of_surfaces(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    normals: ArrayLike,
-    isotropy: ArrayLike,
-    T: ArrayLike,
-    radius: int,
-) -> Float:
+def ends_of_surfaces(grid, points, normals, isotropy, T, radius):
     """(N, 2) normals in the map of the flat surfaces whose mapped part ends at a point; else 0.
 
     0 too where the scan looks ahead: the mean cosine of the bearings, which weigh the same here, is
@@ -97,7 +89,7 @@ def ends_of_surfaces(
     return out
 
 
-def _field_at_end(grid: OccupancyGrid, y: Float, normal: Float, sigma: float, radius: int) -> float:
+def _field_at_end(grid, y, normal, sigma, radius):
     """F where the mapped part of a surface ends: the mean of the m_k times exp(-d^2 / 2 sigma^2).
 
     d is the distance along the normal from the mean of the mu_k.
@@ -109,17 +101,7 @@ def _field_at_end(grid: OccupancyGrid, y: Float, normal: Float, sigma: float, ra
     return float(m.mean() * exp(-(distance**2) / (2 * sigma**2)))
 
 
-def registration_cost(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    weights: ArrayLike,
-    T: ArrayLike,
-    sigma: float,
-    radius: int,
-    floor: float,
-    unknown: float,
-    ends: Float | None = None,
-) -> float:
+def registration_cost(grid, points, weights, T, sigma, radius, floor, unknown, ends=None):
     """- sum of w_n ln(floor + unknown U(T p_n) + F(T p_n)) over the points that are finite.
 
     U is 1 in unobserved cells, 0 elsewhere.
@@ -149,23 +131,14 @@ def registration_cost(
     return float(cost)
 
 
-def _base(grid: OccupancyGrid, y: Float, floor: float, unknown: float) -> float:
+def _base(grid, y, floor, unknown):
     unseen = isnan(grid.occupancy_of(tuple(cell_of(y, grid.resolution).tolist())))
     return floor + (unknown if unseen else 0.0)
 
 
 def registration_gradient(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    weights: ArrayLike,
-    T: ArrayLike,
-    sigma: float,
-    radius: int,
-    floor: float,
-    unknown: float,
-    ends: Float | None = None,
-    step: float = 1e-6,
-) -> Float:
+    grid, points, weights, T, sigma, radius, floor, unknown, ends=None, step=1e-06
+):
     """Gradient of `registration_cost` by central differences.
 
     Returns:
@@ -185,16 +158,7 @@ def registration_gradient(
     return np.array(gradient)
 
 
-def registration_curvature(
-    grid: OccupancyGrid,
-    points: ArrayLike,
-    weights: ArrayLike,
-    T: ArrayLike,
-    sigma: float,
-    radius: int,
-    floor: float,
-    unknown: float,
-) -> Float:
+def registration_curvature(grid, points, weights, T, sigma, radius, floor, unknown):
     """Approximate Hessian of `registration_cost` used by the Newton steps.
 
     The sum of w_n s_n J_n^T A_n J_n: s = F / (base + F) is the inlier probability of a
@@ -218,7 +182,7 @@ def registration_curvature(
     return H
 
 
-def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Float:
+def _curvature(grid, y, sigma, radius):
     """(2, 2) sigma^-2 I - sigma^-4 C / v without its negative part.
 
     C is the spread of the means mu_k around y, each weighted with its part of F, and v the
@@ -241,7 +205,7 @@ def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Floa
     return kept
 
 
-def retract(T: Float, delta: Float) -> Float:
+def retract(T, delta):
     """T_map_sensor (3, 3) shifted by delta[:2] and turned by delta[2] about its own position."""
     out, turn = T.copy(), delta[2]
     out[:2, 2] += delta[:2]

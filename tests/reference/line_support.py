@@ -1,22 +1,13 @@
 """Support of a surfel by static surfels on a line through its cell."""
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+# ruff: noqa: ARG001  (threads: as the kernels have it)
 
-from reference.surfel_map import SurfelMap
+import numpy as np
 
 DIRECTIONS = 12
 
 
-def line_support(
-    surfel_map: SurfelMap,
-    p_static: ArrayLike,
-    *,
-    radius: float,
-    gap: float,
-    half_width: float,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> NDArray[np.float64]:
+def line_support(surfel_map, p_static, *, radius, gap, half_width, threads=1):
     """(E,) of 12 lines the largest sum of `p_static` (E,) of other surfels on one.
 
     Lengths are in cells. A surfel is on a line if its cell is `gap` to `radius` away and less than

@@ -1,30 +1,26 @@
 """Mean-field inference of P(static) in a Markov random field over surfels."""
 
-from collections.abc import Iterator
+# ruff: noqa: ARG001  (threads: as the kernels have it)
+
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from reference.surfel_map import SurfelMap
-
-Float = NDArray[np.float64]
 
 
 def smooth_mean_field(
-    surfel_map: SurfelMap,
-    log_odds: ArrayLike,
+    surfel_map,
+    log_odds,
     *,
-    radius: float,
-    coplanar_std: float,
-    static_coupling: float,
-    dynamic_coupling: float,
-    min_log_odds: float,
-    max_log_odds: float,
-    tolerance: float,
-    max_iterations: int,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> Float:
+    radius,
+    coplanar_std,
+    static_coupling,
+    dynamic_coupling,
+    min_log_odds,
+    max_log_odds,
+    tolerance,
+    max_iterations,
+    threads=1,
+):
     """(E,) P(static) from the log odds (E,) of each surfel alone and from its neighbours.
 
     Lengths are in cells. Each iteration updates the surfels with a neighbour whose probability
@@ -60,7 +56,7 @@ def smooth_mean_field(
     return p
 
 
-def neighbours(surfel_map: SurfelMap, i: int, radius: float) -> Iterator[int]:
+def neighbours(surfel_map, i, radius):
     """Surfels within a radius, in cells."""
     number, reach = surfel_map.index_of_cell(), int(radius)
     for off in product(range(-reach, reach + 1), repeat=surfel_map.dimension):
@@ -69,7 +65,7 @@ def neighbours(surfel_map: SurfelMap, i: int, radius: float) -> Iterator[int]:
             yield number[cell]
 
 
-def coplanarity(surfel_map: SurfelMap, i: int, j: int, coplanar_std: float) -> float:
+def coplanarity(surfel_map, i, j, coplanar_std):
     """Weight of a pair by the distance of each mean from the plane of the other."""
     one, other = surfel_map.fitted[i], surfel_map.fitted[j]
     offset = (other.mean - one.mean) / surfel_map.resolution
@@ -77,14 +73,7 @@ def coplanarity(surfel_map: SurfelMap, i: int, j: int, coplanar_std: float) -> f
     return float(np.exp(-0.5 * (distance / coplanar_std) ** 2))
 
 
-def _neighbour_log_odds(
-    hit_spans: list[list[int]],
-    i: int,
-    adjacent: list[tuple[int, float]],
-    p: Float,
-    static_coupling: float,
-    dynamic_coupling: float,
-) -> float:
+def _neighbour_log_odds(hit_spans, i, adjacent, p, static_coupling, dynamic_coupling):
     """Log odds contributed by the neighbours of a surfel."""
     static = dynamic = 0.0
     weight = 1.0
@@ -104,5 +93,5 @@ def _neighbour_log_odds(
     return (static_coupling * static - dynamic_coupling * dynamic) / weight
 
 
-def _probability(log_odds: Float) -> Float:
+def _probability(log_odds):
     return np.asarray(1.0 / (1.0 + np.exp(-log_odds)))

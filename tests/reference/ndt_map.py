@@ -15,12 +15,12 @@ Float = NDArray[np.float64]
 class NdtMap3D:
     """Weight, first and second moments of end points per voxel and level, about its centre."""
 
-    def __init__(self, edge: float, levels: int, max_weight: float) -> None:
+    def __init__(self, edge, levels, max_weight):
         self.edges = [edge * 2.0**level for level in range(levels)]
         self.max_weight = max_weight
         self.cells: list[dict[tuple[int, ...], list[Any]]] = [{} for _ in self.edges]
 
-    def add(self, points: Float, weights: Float, T_map_base: Float) -> None:
+    def add(self, points, weights, T_map_base):
         for point, weight in zip(points.astype(float), weights.astype(float), strict=True):
             if not np.isfinite(point).all() or weight <= 0.0:
                 continue
@@ -34,7 +34,7 @@ class NdtMap3D:
                     sums[1] += weight * x
                     sums[2] += weight * np.outer(x, x)
 
-    def crop(self, T_map_base: Float, radius: float) -> None:
+    def crop(self, T_map_base, radius):
         for level, edge in enumerate(self.edges):
             self.cells[level] = {
                 cell: sums
@@ -42,9 +42,7 @@ class NdtMap3D:
                 if np.linalg.norm((np.array(cell) + 0.5) * edge - T_map_base[:3, 3]) <= radius
             }
 
-    def plane(
-        self, place: Float, level: int, min_weight: float, max_flatness: float, min_extent: float
-    ) -> tuple[Float, float, float] | None:
+    def plane(self, place, level, min_weight, max_flatness, min_extent):
         """Normal, offset along it and variance across; None where there is no plane."""
         x = place / self.edges[level]
         low = np.floor(x - 0.5)
@@ -71,7 +69,7 @@ class NdtMap3D:
         return axes[:, 0], float(axes[:, 0] @ mean) * edge, max(variance[0], 0.0) * edge**2
 
 
-def voxel_downsample(points: Float, weights: Float, voxel_size: float) -> NDArray[np.int64]:
+def voxel_downsample(points, weights, voxel_size):
     """Indices of the first usable point of positive weight in each voxel."""
     usable = np.flatnonzero(np.isfinite(points).all(axis=1) & (weights > 0.0))
     cells = np.floor(points[usable].astype(float) / voxel_size)
@@ -79,7 +77,7 @@ def voxel_downsample(points: Float, weights: Float, voxel_size: float) -> NDArra
     return usable[np.sort(first)].astype(np.int64)
 
 
-def transform_by_twist(points: Float, times: Float, twist: Float) -> Float:
+def transform_by_twist(points, times, twist):
     """Exp(time twist) p of each point."""
     T = se3.exp(times.astype(float)[:, None] * twist)
     transformed: Float = np.einsum("nij,nj->ni", T[:, :3, :3], points.astype(float)) + T[:, :3, 3]
@@ -99,21 +97,21 @@ class QuadraticModel:
 
 
 def linearise_sweep(
-    map: NdtMap3D,
-    points: Float,
-    weights: Float,
-    times: Float,
-    T: Float,
-    twist: Float,
+    map,
+    points,
+    weights,
+    times,
+    T,
+    twist,
     *,
-    min_weight: float,
-    max_flatness: float,
-    min_extent: float,
-    range_std: float,
-    kernel_width: float,
-    level: int,
-    slack: float,
-) -> QuadraticModel:
+    min_weight,
+    max_flatness,
+    min_extent,
+    range_std,
+    kernel_width,
+    level,
+    slack,
+):
     """The objective of docs/poses.md, beam by beam."""
     q = QuadraticModel(np.zeros((12, 12)), np.zeros(12))
     still = transform_by_twist(points, times, twist)
@@ -143,21 +141,21 @@ def linearise_sweep(
 
 
 def register_sweep(
-    map: NdtMap3D,
-    points: Float,
-    weights: Float,
-    times: Float,
-    T_prior: Float,
-    twist_prior: Float,
-    information: Float,
+    map,
+    points,
+    weights,
+    times,
+    T_prior,
+    twist_prior,
+    information,
     *,
-    information_scale: float,
-    start_level: int,
-    start_slack: float,
-    max_iterations: int,
-    tolerance: float,
-    **options: float,
-) -> tuple[Float, Float, Float]:
+    information_scale,
+    start_level,
+    start_slack,
+    max_iterations,
+    tolerance,
+    **options,
+):
     """Pose, twist and covariance after Gauss-Newton steps from the prior."""
     T, twist = T_prior.copy(), twist_prior.copy()
     level, slack, steps = start_level, start_slack, 0

@@ -1,18 +1,17 @@
 """Beams without a return: which of them are evidence of free space, and up to which range."""
 
-from collections.abc import Sequence
+# ruff: noqa: ARG001  (threads: as the kernels have it)
+
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from reference.beam_counting import Beam, passed_cells, usable_beams
-from reference.occupancy_grid import Cell, OccupancyGrid
+from reference.beam_counting import passed_cells, usable_beams
 
 MIN_RUN = 3  # adjacent beams without a return; shorter runs are not trusted
 
 
-def beams_in_runs(beams: Sequence[Beam]) -> set[int]:
+def beams_in_runs(beams):
     """Numbers of the beams without a return in runs of at least MIN_RUN."""
     scan_of = {beam.number: beam.scan for beam in beams if not beam.hit}
     found: set[int] = set()
@@ -24,16 +23,8 @@ def beams_in_runs(beams: Sequence[Beam]) -> set[int]:
 
 
 def add_no_return_beams(
-    grid: OccupancyGrid,
-    rest: OccupancyGrid,
-    points: ArrayLike,
-    hit: ArrayLike,
-    offset: ArrayLike,
-    T_map_sensor: ArrayLike,
-    stop_cells: ArrayLike,
-    end_margin: float,
-    threads: int = 1,  # noqa: ARG001  signature of the kernel
-) -> None:
+    grid, rest, points, hit, offset, T_map_sensor, stop_cells, end_margin, threads=1
+):
     """Add beams without a return as `add_beams` does, the trusted part to `grid`.
 
     The remainder goes to `rest`. Runs of fewer than MIN_RUN beams are not trusted. The others are
@@ -56,7 +47,7 @@ def add_no_return_beams(
             (grid if k < n else rest).add(cell, 0.0, chord)
 
 
-def count_cells_within(way: Sequence[tuple[Cell, float]], opaque: set[Cell], limit: float) -> int:
+def count_cells_within(way, opaque, limit):
     """Number of leading cells that are left within `limit` cells and are not `opaque`."""
     left_at = accumulate(chord for _, chord in way)
     for k, ((cell, _), left) in enumerate(zip(way, left_at, strict=True)):

@@ -1,18 +1,12 @@
 """Observations of surfels by the beams of one time bin: hits, and misses of some reliability."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from reference.beam_counting import Beam
 from reference.no_return_beams import beams_in_runs
 from reference.ray_traversal import cell_of, traverse
-from reference.surfel_map import Surfel, SurfelMap
-
-Float = NDArray[np.float64]
 
 HIT = -1.0  # instead of the reliability of a miss
 SURE = 0.95  # crossing probabilities above are 1
@@ -40,15 +34,13 @@ class MeasurementModel:
     use_normals: bool = True
     trust: float = 1.0
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         for name in ("lateral_std", "margin", "hit_radius", "end_margin"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name}: expected a positive length")
 
 
-def observe(
-    surfel_map: SurfelMap, beams: Sequence[Beam], model: MeasurementModel
-) -> dict[int, float]:
+def observe(surfel_map, beams, model):
     """Observations of surfels in one time bin: HIT, or the reliability of a miss.
 
     A surfel is hit where a beam ends in its cell or within `hit_radius` of a surfel in whose cell
@@ -81,14 +73,12 @@ def observe(
     return misses | dict.fromkeys(hit, HIT)
 
 
-def is_solid(surfel: Surfel, model: MeasurementModel) -> bool:
+def is_solid(surfel, model):
     """Whether a surfel is planar and has many returns."""
     return model.use_normals and surfel.plane is not None and surfel.beams >= SOLID
 
 
-def crossed_surfels(
-    surfel_map: SurfelMap, index: dict[tuple[int, ...], int], beam: Beam, model: MeasurementModel
-) -> list[tuple[int, float]]:
+def crossed_surfels(surfel_map, index, beam, model):
     """(surfel, P(crossing)) of all surfels whose cells the beam crosses before its end."""
     way = beam.end - beam.start
     length = float(np.linalg.norm(way))
@@ -103,14 +93,7 @@ def crossed_surfels(
     return [(k, _p_crossing(surfel_map.fitted[k], *line)) for k in crossed if k is not None]
 
 
-def _p_crossing(
-    surfel: Surfel,
-    sphere_radius: float,
-    start: Float,
-    direction: Float,
-    end: Float | None,
-    model: MeasurementModel,
-) -> float:
+def _p_crossing(surfel, sphere_radius, start, direction, end, model):
     """P(a beam crosses the surfel within its extent), with Gaussian lateral noise.
 
     `end` is the end point of a return; surfels that are not planar are spheres. A disc seen at an
@@ -130,7 +113,7 @@ def _p_crossing(
     return float(p)
 
 
-def view_angle_between(before: Float, now: Float, position: Float, resolution: float) -> float:
+def view_angle_between(before, now, position, resolution):
     """Change of the line of sight to a position (D,): robot displacement / distance, radians.
 
     Distances below a cell count as one cell.

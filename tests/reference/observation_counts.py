@@ -1,14 +1,14 @@
 """Number of time bins in which cells were observed, and were clear of moving objects."""
 
+# ruff: noqa: ARG002  (threads: as the kernels have it)
+
 import itertools
 from collections import Counter
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from reference.beam_counting import Beam, passed_cells, usable_beams
+from reference.beam_counting import passed_cells, usable_beams
 from reference.no_return_beams import beams_in_runs, count_cells_within
 from reference.occupancy_grid import Cell, OccupancyGrid
 from reference.ray_traversal import cell_of
@@ -29,15 +29,7 @@ class ObservationCounts:
         end_margin: metres before their end in which they are not trusted.
     """
 
-    def __init__(
-        self,
-        resolution: float,
-        dimension: int,
-        *,
-        radius: float,
-        stop_cells: ArrayLike | None = None,
-        end_margin: float = 0.0,
-    ) -> None:
+    def __init__(self, resolution, dimension, *, radius, stop_cells=None, end_margin=0.0):
         if not (radius >= 0 and end_margin >= 0):
             raise ValueError("radius, end_margin: expected lengths that are not negative")
         self.grid = OccupancyGrid(resolution, dimension)  # where cells lie
@@ -49,16 +41,7 @@ class ObservationCounts:
         self.observed: Counter[Cell] = Counter()
         self.clear: Counter[Cell] = Counter()
 
-    def add(
-        self,
-        points: ArrayLike,
-        hit: ArrayLike,
-        is_dynamic: ArrayLike,
-        offset: ArrayLike,
-        T_map_sensor: ArrayLike,
-        time_bin: ArrayLike,
-        threads: int = 1,  # noqa: ARG002  signature of the kernel
-    ) -> None:
+    def add(self, points, hit, is_dynamic, offset, T_map_sensor, time_bin, threads=1):
         """Add scans; `is_dynamic` (M,): dynamic hits, `time_bin` (T,): time bin of each scan."""
         beams = list(usable_beams(self.grid.dimension, points, hit, offset, T_map_sensor))
         moves, number = np.asarray(is_dynamic, bool), np.asarray(time_bin, np.int64)
@@ -70,9 +53,7 @@ class ObservationCounts:
             self.observed.update(seen)
             self.clear.update(seen - self._cells_near(ends))
 
-    def dense(
-        self, first_cell: ArrayLike, shape: tuple[int, ...]
-    ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    def dense(self, first_cell, shape):
         """Observed and clear counts over a box of cells, axes as of `OccupancyGrid.dense`."""
         observed, clear = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
         for cell, count in self.observed.items():
@@ -84,7 +65,7 @@ class ObservationCounts:
                 )
         return observed, clear
 
-    def _observed_cells(self, beam: Beam, in_rows: set[int]) -> set[Cell]:
+    def _observed_cells(self, beam, in_rows):
         """Cells that a beam observes: those where it adds to the sums of (10)."""
         way = list(passed_cells(self.grid, beam))
         if beam.hit:
@@ -95,7 +76,7 @@ class ObservationCounts:
             way = way[: count_cells_within(way, self.stop_cells, limit / self.grid.resolution)]
         return {cell for cell, chord in way if chord > 0}
 
-    def _cells_near(self, ends: Sequence[Beam]) -> set[Cell]:
+    def _cells_near(self, ends):
         """Cells near dynamic returns."""
         reach = self.radius / self.grid.resolution * (1 + 1e-9)
         span = range(-int(reach), int(reach) + 1)
@@ -107,7 +88,7 @@ class ObservationCounts:
         cells = {self._end(beam) for beam in ends}
         return {tuple((np.array(c) + step).tolist()) for c in cells for step in steps}
 
-    def _end(self, beam: Beam) -> Cell:
+    def _end(self, beam):
         return tuple(cell_of(beam.end, self.grid.resolution).tolist())
 
 

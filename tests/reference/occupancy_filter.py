@@ -53,18 +53,18 @@ class OccupancyFilter:
 
     def __init__(
         self,
-        resolution: float,
+        resolution,
         *,
-        rho: list[float],
-        tau: list[float],
-        weights: list[float],
-        n_static: int,
-        p_detection: float,
-        bin_seconds: float,
-        lateral_std: float,
-        hit_radius: float,
-        max_log_ratio: float,
-    ) -> None:
+        rho,
+        tau,
+        weights,
+        n_static,
+        p_detection,
+        bin_seconds,
+        lateral_std,
+        hit_radius,
+        max_log_ratio,
+    ):
         self.resolution = resolution
         self.rho, self.tau, self.weights = np.array(rho), np.array(tau), np.array(weights)
         self.n_static, self.p_detection, self.bin_seconds = n_static, p_detection, bin_seconds
@@ -74,7 +74,7 @@ class OccupancyFilter:
         self.filters: dict[tuple[int, ...], Filter] = {}
 
     @property
-    def size(self) -> int:
+    def size(self):
         return len(self.filters)
 
     def add(self, points, hit, margin, offset, T_map_sensor, *, time_bin, tag):
@@ -95,12 +95,12 @@ class OccupancyFilter:
             out[beam.number] = max((self.posterior(k)[0] for k in near), default=prior)
         return out
 
-    def p_standing(self) -> dict[tuple[int, ...], float]:
+    def p_standing(self):
         """P(static and occupied) of every known cell."""
         free = {cell: 0.0 for cell, at in self.passed.items() if at.bins}
         return free | {cell: self.posterior(cell)[1] for cell in self.filters}
 
-    def posterior(self, cell: tuple[int, ...]) -> tuple[float, float]:
+    def posterior(self, cell):
         """P(static), P(static and occupied now)."""
         one = self.filters[cell]
         p, log_likelihood = one.p_occupied, one.log_likelihood
@@ -126,7 +126,7 @@ class OccupancyFilter:
     def _normalize(self, log_likelihood):
         return np.maximum(log_likelihood - log_likelihood.max(), -self.max_log_ratio)
 
-    def _open(self, one: Filter, time_bin: int) -> bool:
+    def _open(self, one, time_bin):
         """False if the open bin is a later one."""
         if one.open_bin is not None and one.open_bin >= time_bin:
             return one.open_bin == time_bin
@@ -141,7 +141,7 @@ class OccupancyFilter:
         one.hit, one.p_missed = False, 1.0
         return True
 
-    def _pass(self, beam, margin: float, time_bin: int, tag: int) -> None:
+    def _pass(self, beam, margin, time_bin, tag):
         start, end = beam.start / self.resolution, beam.end / self.resolution
         length = float(np.linalg.norm(end - start))
         if length - margin <= 0.0:
@@ -165,7 +165,7 @@ class OccupancyFilter:
                 at.bins += 1
                 at.last_bin = time_bin
 
-    def _add_filter(self, end: Float, tag: int) -> None:
+    def _add_filter(self, end, tag):
         key = tuple(np.floor(end).astype(int).tolist())
         at = self.passed.setdefault(key, Passed())
         at.tag = tag
@@ -173,13 +173,13 @@ class OccupancyFilter:
             passes = [CLEARLY_PASSED] * min(at.bins, MAX_PASSES)
             self.filters[key] = self._new_filter(passes, at.last_bin, tag)
 
-    def _hit(self, end: Float, time_bin: int, tag: int) -> None:
+    def _hit(self, end, time_bin, tag):
         for near in self._near(end):
             one = self.filters[near]
             if self._open(one, time_bin):
                 one.hit, one.tag = True, tag
 
-    def _new_filter(self, passes: list[float], last_bin: int, tag: int) -> Filter:
+    def _new_filter(self, passes, last_bin, tag):
         """After passes with these reliabilities, one for each bin; last_bin: -1: none."""
         p, log_likelihood = self.rho.copy(), -np.log(self.rho * self.p_detection)
         for n, reliability in enumerate(passes):
@@ -187,7 +187,7 @@ class OccupancyFilter:
         last = None if last_bin < 0 else last_bin
         return Filter(p, self._normalize(log_likelihood), last, tag)
 
-    def _near(self, end: Float) -> list[tuple[int, ...]]:
+    def _near(self, end):
         """The filters of the end cell, and of neighbours with centres within the hit radius."""
         own = np.floor(end).astype(int)
         found = []

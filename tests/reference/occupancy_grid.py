@@ -3,10 +3,9 @@
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Cell = tuple[int, ...]
 
 
@@ -18,7 +17,7 @@ class OccupancyGrid:
         dimension: 2 or 3.
     """
 
-    def __init__(self, resolution: float, dimension: int) -> None:
+    def __init__(self, resolution, dimension):
         if not 0 < resolution < np.inf:
             raise ValueError(f"resolution must be positive, got {resolution}")
         self.resolution = resolution
@@ -27,7 +26,7 @@ class OccupancyGrid:
         self.beta: dict[Cell, float] = {}
         self.moment: dict[Cell, Float] = {}
 
-    def add(self, cell: Cell, alpha: float, beta: float, end_point: Float | None = None) -> None:
+    def add(self, cell, alpha, beta, end_point=None):
         """Add to the sums of one cell; `end_point` (D,) metres counts with weight `alpha`."""
         self.alpha[cell] = self.alpha.get(cell, 0.0) + alpha
         self.beta[cell] = self.beta.get(cell, 0.0) + beta
@@ -35,18 +34,18 @@ class OccupancyGrid:
             before = self.moment.get(cell, np.zeros(self.dimension))
             self.moment[cell] = before + alpha * end_point
 
-    def alpha_beta(self, cells: ArrayLike) -> Float:
+    def alpha_beta(self, cells):
         """(K, 2) alpha and beta of cells (K, D); zeros for unobserved cells."""
         keys = [tuple(cell) for cell in np.asarray(cells, np.int64).reshape(-1, self.dimension)]
         pairs = [(self.alpha.get(k, 0.0), self.beta.get(k, 0.0)) for k in keys]
         return np.array(pairs).reshape(-1, 2)
 
-    def occupancy_of(self, cell: Cell) -> float:
+    def occupancy_of(self, cell):
         """m_j of (15), NaN where alpha + beta = 0: unknown."""
         alpha, beta = self.alpha.get(cell, 0.0), self.beta.get(cell, 0.0)
         return alpha / (alpha + beta) if alpha + beta > 0 else float("nan")
 
-    def merge(self, other: "OccupancyGrid") -> None:
+    def merge(self, other):
         """Add the sums of another grid of the same resolution and dimension."""
         if (self.resolution, self.dimension) != (other.resolution, other.dimension):
             raise ValueError(
@@ -58,7 +57,7 @@ class OccupancyGrid:
         for cell, moment in other.moment.items():
             self.moment[cell] = self.moment.get(cell, np.zeros(self.dimension)) + moment
 
-    def bounding_box(self) -> tuple[Int, tuple[int, ...]]:
+    def bounding_box(self):
         """First cell (D,) and shape of the bounding box of all observed cells."""
         if not self.alpha:
             return np.zeros(self.dimension, np.int64), (0,) * self.dimension
@@ -66,9 +65,7 @@ class OccupancyGrid:
         first = cells.min(axis=0)
         return first, tuple((cells.max(axis=0) - first + 1)[::-1].tolist())
 
-    def dense(
-        self, first_cell: ArrayLike | None = None, shape: tuple[int, ...] | None = None
-    ) -> tuple[Int, Float, Float]:
+    def dense(self, first_cell=None, shape=None):
         """Sums over a box of cells, by default the bounding box.
 
         Returns:
@@ -91,7 +88,7 @@ OccupancyGrid2D = partial(OccupancyGrid, dimension=2)
 OccupancyGrid3D = partial(OccupancyGrid, dimension=3)
 
 
-def occupancy(alpha: ArrayLike, beta: ArrayLike) -> Float:
+def occupancy(alpha, beta):
     """Equation (15): alpha / (alpha + beta), NaN where alpha + beta = 0 (unobserved)."""
     a = np.asarray(alpha, float)
     total = a + np.asarray(beta, float)

@@ -1,11 +1,12 @@
 """Occupancy HMM: likelihood of the observations of each surfel under two-state Markov chains."""
 
-from collections.abc import Sequence
+# ruff: noqa: ARG002  (threads: as the kernels have it)
+
 from dataclasses import replace
 from math import exp, inf, log
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from reference.beam_counting import Beam, usable_beams
 from reference.change_hmm import ChangeModel, summarise_changes
@@ -18,7 +19,6 @@ from reference.observation import (
     observe,
     view_angle_between,
 )
-from reference.surfel_map import Surfel, SurfelMap
 from reference.surroundings import count_misses, mark_misses
 
 Float = NDArray[np.float64]
@@ -26,13 +26,7 @@ Float = NDArray[np.float64]
 STEP = 0.5  # cells; a robot that moves less has not moved
 
 
-def chain_log_likelihood(
-    observations: Sequence[tuple[float, float, float]],
-    rho: float,
-    tau: float,
-    p_detection: float,
-    view_angle: float = inf,
-) -> float:
+def chain_log_likelihood(observations, rho, tau, p_detection, view_angle=inf):
     """ln P(all observations) by the forward algorithm over the states (empty, occupied).
 
     Args:
@@ -72,19 +66,19 @@ class OccupancyHmm:
 
     def __init__(
         self,
-        surfel_map: SurfelMap,
+        surfel_map,
         *,
-        rho: Sequence[float],
-        tau: Sequence[float],
-        view_angle: Sequence[float] = (),
-        p_detection: float,
-        bin_seconds: float,
-        lateral_std: float,
-        margin: float,
-        hit_radius: float,
-        end_margin: float,
-        use_normals: bool = True,
-    ) -> None:
+        rho,
+        tau,
+        view_angle=(),
+        p_detection,
+        bin_seconds,
+        lateral_std,
+        margin,
+        hit_radius,
+        end_margin,
+        use_normals=True,
+    ):
         if len(surfel_map.fitted) != surfel_map.size:
             raise ValueError("surfel_map: fit it first")
         self.surfel_map = surfel_map
@@ -100,16 +94,7 @@ class OccupancyHmm:
         # by time bin, see `mark_misses`
         self.marked: list[dict[int, tuple[float, bool]]] = [{} for _ in surfel_map.fitted]
 
-    def add(
-        self,
-        points: ArrayLike,
-        hit: ArrayLike,
-        offset: ArrayLike,
-        T_map_sensor: ArrayLike,
-        time_bin: ArrayLike,
-        threads: int = 1,  # noqa: ARG002  signature of the kernel
-        positions: ArrayLike | None = None,
-    ) -> None:
+    def add(self, points, hit, offset, T_map_sensor, time_bin, threads=1, positions=None):
         """Add scans with their time bins (T,), which must not decrease.
 
         positions (T, D): of the robot, metres; None: of the sensors.
@@ -132,16 +117,14 @@ class OccupancyHmm:
                 for k, one in marked.items():
                     self.marked[k][n] = one
 
-    def _move_to(self, position: Float) -> Float:
+    def _move_to(self, position):
         if self.position is None or (
             np.linalg.norm(position - self.position) >= STEP * self.surfel_map.resolution
         ):
             self.position = position
         return self.position
 
-    def count_no_return_beams(
-        self, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
-    ) -> tuple[int, int]:
+    def count_no_return_beams(self, points, hit, offset, T_map_sensor):
         """Number of beams without a return in runs, and of those that cross a solid surfel."""
         index = self.surfel_map.index_of_cell()
         beams = list(usable_beams(self.surfel_map.dimension, points, hit, offset, T_map_sensor))
@@ -156,40 +139,34 @@ class OccupancyHmm:
         ]
         return len(through), sum(through)
 
-    def solid_cells(self) -> NDArray[np.int64]:
+    def solid_cells(self):
         """(S, D) cells of planar surfels with many returns."""
         cells = [s.cell for s in self.surfel_map.fitted if is_solid(s, self.model)]
         return np.array(cells, np.int64).reshape(-1, self.surfel_map.dimension)
 
-    def set_trust_beyond_solid(self, trust: float) -> None:
+    def set_trust_beyond_solid(self, trust):
         """Set the trust in beams without a return beyond the first solid surfel."""
         self.model = replace(self.model, trust=trust)
 
-    def track_changes(
-        self, *, tau: float, passer_by_rho: float, passer_by_tau: float, p_detection: float
-    ) -> None:
+    def track_changes(self, *, tau, passer_by_rho, passer_by_tau, p_detection):
         """Enable the change HMM; see ChangeModel."""
         if any(self.observations):
             raise ValueError("track_changes: expected before the first observation")
         self.change_model = ChangeModel(tau, passer_by_rho, passer_by_tau, p_detection)
 
-    def track_surroundings(self, edge: float) -> None:
+    def track_surroundings(self, edge):
         """Enable `miss_counts`; edge: metres, of coarse cells."""
         if any(self.observations):
             raise ValueError("track_surroundings: expected before the first observation")
         self.edge = max(1, round(edge / self.surfel_map.resolution))
 
-    def miss_counts(self) -> NDArray[np.float32]:
+    def miss_counts(self):
         """(E, 2) misses, and those while something was hit in the surroundings."""
         if not self.edge:
             raise ValueError("miss_counts: expected track_surroundings before")
         return np.array([count_misses(one) for one in self.marked], np.float32).reshape(-1, 2)
 
-    def changes(
-        self,
-    ) -> tuple[
-        Float, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]
-    ]:
+    def changes(self):
         """(E,) log likelihood, (E,) occupied share, (E, 2), (E, 2), (E, 2, 2, 2).
 
         See ChangeSummary.
@@ -212,7 +189,7 @@ class OccupancyHmm:
             np.array([one.change_bins for one in summaries], np.int32).reshape(-1, 2, 2, 2),
         )
 
-    def likelihood(self, classes: ArrayLike | None = None) -> tuple[NDArray[np.float32], Float]:
+    def likelihood(self, classes=None):
         """(E, C) relative to the best class, (E,) logarithm of the best; of some classes (bool).
 
         Of the observations of each surfel given one return in its cell: divided by
@@ -236,9 +213,7 @@ class OccupancyHmm:
         best = values.max(axis=1)
         return np.exp(values - best[:, None]).astype(np.float32), best
 
-    def _with_view_angles(
-        self, surfel: Surfel, observations: list[tuple[float, float, Float]]
-    ) -> list[tuple[float, float, float]]:
+    def _with_view_angles(self, surfel, observations):
         """Observations of a surfel, each with the change of the line of sight since the last."""
         before = [position for _, _, position in observations[:1] + observations[:-1]]
         cell = self.surfel_map.resolution

@@ -1,24 +1,9 @@
 """Projection of a 3D scan to the plane; see `stillmap.mapping.projection`."""
 
 import numpy as np
-from numpy.typing import NDArray
-
-from stillmap.em import GroundMap
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
-def project_scan(
-    points: NDArray[np.float32],
-    hit: NDArray[np.bool_],
-    T: Float,
-    ground: GroundMap,
-    heights: tuple[float, float, float],
-    cell: float,
-    directions: int,
-    open_space: bool,
-) -> tuple[Float, NDArray[np.bool_], Index]:
+def project_scan(points, hit, T, ground, heights, cell, directions, open_space):
     """End points (n, 2) in the map frame, whether they are hits, and their beams.
 
     heights: low, high, top: metres above the ground, of obstacles, and of what shows free space.
@@ -45,7 +30,7 @@ def project_scan(
     return T[:2, 3] + beam[some], is_obstacle[some], at[some]
 
 
-def _share_in_band(start: float, above: Float, low: float, top: float) -> Float:
+def _share_in_band(start, above, low, top):
     """(n,) share of its length after which a beam leaves the band; heights above the ground."""
     rise = above - start
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,18 +1,14 @@
 """Cells and chord lengths along a segment: the l_j of the last paragraph of Sect. 3."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
-def cell_of(point: ArrayLike, resolution: float) -> Int:
+def cell_of(point, resolution):
     """(..., D) integer cells of points (..., D) in metres: floor(x / resolution)."""
     return np.floor(np.asarray(point, float) / resolution).astype(np.int64)
 
 
-def traverse(start: ArrayLike, end: ArrayLike, resolution: float) -> tuple[Int, Float]:
+def traverse(start, end, resolution):
     """Cells of a segment in order, start cell first and end cell last, with chord lengths.
 
     Neighbours in the list differ by one step along one axis. A segment through a corner passes
@@ -48,7 +44,7 @@ def traverse(start: ArrayLike, end: ArrayLike, resolution: float) -> tuple[Int, 
     return np.array(cells), np.diff(t) * np.linalg.norm(b - a) / resolution
 
 
-def _crossings(a: Float, b: Float, first: Int, last: Int) -> list[tuple[float, int, int]]:
+def _crossings(a, b, first, last):
     """(where along the segment in [0, 1], axis, +1 or -1) of each border crossed, in order."""
     found = []
     for axis in range(len(a)):

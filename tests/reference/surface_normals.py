@@ -1,18 +1,9 @@
 """Normals of a planar scan, and what they say about its pose."""
 
 import numpy as np
-from numpy.typing import NDArray
-
-Float = NDArray[np.float64]
 
 
-def estimate_normals(
-    points: Float,
-    radius: float,
-    max_gap: float,
-    flat_below: float,
-    round_from: float,
-) -> tuple[Float, Float]:
+def estimate_normals(points, radius, max_gap, flat_below, round_from):
     """Normals (N, 2) and isotropy (N,) of the surfaces at end points (N, 2).
 
     The neighbors of an end point are the successive ones to either side that are within `radius`
@@ -46,9 +37,7 @@ def estimate_normals(
     return normals, isotropy
 
 
-def surface_information(
-    points: Float, weights: Float, normals: Float, isotropy: Float, pose: Float
-) -> Float:
+def surface_information(points, weights, normals, isotropy, pose):
     """Information (3, 3) about x, y, heading of weighted end points at a pose (3, 3)."""
     out = np.zeros((3, 3))
     R = pose[:2, :2]

@@ -1,17 +1,18 @@
 """Surfel map: one surfel per cell with returns, and the plane through its neighbourhood."""
 
+# ruff: noqa: ARG002  (threads: as the kernels have it)
+
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from reference.beam_counting import Beam, usable_beams
+from reference.beam_counting import usable_beams
 from reference.ray_traversal import cell_of
 
 Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Cell = tuple[int, ...]
 
 WINDOWS = (2, 4, 6)  # radii in cells; the first with half of the returns on planes is used
@@ -76,7 +77,7 @@ class SurfelMap:
         noise_std: metres, median of `across` over all returns on planes.
     """
 
-    def __init__(self, resolution: float, dimension: int) -> None:
+    def __init__(self, resolution, dimension):
         if not 0 < resolution < np.inf:
             raise ValueError(f"resolution: expected a positive length, got {resolution}")
         self.resolution = resolution
@@ -88,17 +89,10 @@ class SurfelMap:
         self.noise_std = 0.0
 
     @property
-    def size(self) -> int:
+    def size(self):
         return len(self.ends)
 
-    def add_end_points(
-        self,
-        points: ArrayLike,
-        hit: ArrayLike,
-        offset: ArrayLike,
-        T_map_sensor: ArrayLike,
-        time_bin: ArrayLike | None = None,
-    ) -> None:
+    def add_end_points(self, points, hit, offset, T_map_sensor, time_bin=None):
         """Add end points of returns; time_bin (T,) of their scans."""
         for beam in usable_beams(self.dimension, points, hit, offset, T_map_sensor):
             if beam.hit:
@@ -108,7 +102,7 @@ class SurfelMap:
                 if time_bin is not None:
                     self.time_bins.setdefault(cell, []).append(int(np.asarray(time_bin)[beam.scan]))
 
-    def fit(self) -> None:
+    def fit(self):
         """Fit means, planes and noise_std; noisy data needs wider windows."""
         for radius in WINDOWS:
             self.fitted = [self._fit_surfel(cell, radius) for cell in self.ends]
@@ -120,7 +114,7 @@ class SurfelMap:
         if self.dimension == 2 and are_planar and 2.0 * self.noise_std <= FACE * self.resolution:
             self.fitted = [e if e.plane else self._fit_face(e, radius) for e in self.fitted]
 
-    def surfels(self) -> tuple[Int, Float, Float, Float, Float, Int]:
+    def surfels(self):
         """cells, means, normals (E, D) each, off_plane, prominence, beams (E,) each."""
         D, nowhere = self.dimension, np.zeros(self.dimension)
         return (
@@ -133,19 +127,12 @@ class SurfelMap:
         )
 
     @property
-    def hit_spans(self) -> NDArray[np.int32]:
+    def hit_spans(self):
         """(E, 2) first and last time bin with a return, if bins were given."""
         spans = [(min(bins), max(bins)) for bins in self.time_bins.values()]
         return np.array(spans, np.int32).reshape(-1, 2)
 
-    def associate_beams(
-        self,
-        points: ArrayLike,
-        hit: ArrayLike,
-        offset: ArrayLike,
-        T_map_sensor: ArrayLike,
-        threads: int = 1,  # noqa: ARG002  signature of the kernel
-    ) -> NDArray[np.int32]:
+    def associate_beams(self, points, hit, offset, T_map_sensor, threads=1):
         """(M,) index of the surfel that each beam ended on, -1: none."""
         number = self.index_of_cell()
         out = np.full(len(np.asarray(points)), -1, np.int32)
@@ -154,11 +141,11 @@ class SurfelMap:
                 out[beam.number] = self._associate(beam, number)
         return out
 
-    def index_of_cell(self) -> dict[Cell, int]:
+    def index_of_cell(self):
         """Index of the surfel of each cell."""
         return {cell: k for k, cell in enumerate(self.ends)}
 
-    def _associate(self, beam: Beam, number: dict[Cell, int]) -> int:
+    def _associate(self, beam, number):
         """Surfel of the end cell, or the nearest adjacent one whose plane the end point is on."""
         own = number.get(self._end_cell(beam), -1)
         if self.dimension == 2 or own < 0 or not self._is_off_plane(own, beam.end):
@@ -167,17 +154,17 @@ class SurfelMap:
         fit = [k for k in adjacent if not self._is_off_plane(k, beam.end)]
         return min(fit, key=lambda k: np.sum((self.fitted[k].mean - beam.end) ** 2), default=own)
 
-    def _is_off_plane(self, k: int, end: Float) -> bool:
+    def _is_off_plane(self, k, end):
         plane = self.fitted[k].plane
         least = MIN_OFF * self.resolution
         return plane is not None and bool(
             abs(plane.normal @ (end - plane.centre)) > OFF_END * self.noise_std + least
         )
 
-    def _end_cell(self, beam: Beam) -> Cell:
+    def _end_cell(self, beam):
         return tuple(cell_of(beam.end, self.resolution).tolist())
 
-    def _fit_surfel(self, cell: Cell, radius: int) -> Surfel:
+    def _fit_surfel(self, cell, radius):
         """Surfel of a cell from the end points in a window around it."""
         window = [c for c in window_cells(cell, radius) if c in self.ends]
         ends = self.ends[cell]
@@ -189,7 +176,7 @@ class SurfelMap:
             plane=self._fit_plane(cell, window, radius),
         )
 
-    def _fit_plane(self, cell: Cell, window: list[Cell], radius: int) -> Plane | None:
+    def _fit_plane(self, cell, window, radius):
         around = np.array([end for c in window for end in self.ends[c]])
         variance, axes = np.linalg.eigh(np.cov(around.T, bias=True))  # ascending
         if not self._is_flat(variance, radius):
@@ -208,14 +195,14 @@ class SurfelMap:
             across=float(np.sqrt(max(variance[0], 0.0))),
         )
 
-    def _is_extended(self, variance: Float, radius: int) -> bool:
+    def _is_extended(self, variance, radius):
         return bool(variance[1] > MIN_EXTENT * (radius * self.resolution) ** 2)
 
-    def _is_flat(self, variance: Float, radius: int) -> bool:
+    def _is_flat(self, variance, radius):
         flat = bool(variance[0] < MAX_FLATNESS * variance[1])
         return flat and self._is_extended(variance, radius)
 
-    def _fit_face(self, surfel: Surfel, radius: int) -> Surfel:
+    def _fit_face(self, surfel, radius):
         """With the plane of the face that it is on, where a wall has another one in the window."""
         window = [c for c in window_cells(surfel.cell, radius) if c in self.ends]
         ends = np.array([end for c in window for end in self.ends[c]])
@@ -246,12 +233,12 @@ class SurfelMap:
         is_face = views[0] * views[1] < 0.0 or lasts
         return replace(surfel, plane=plane) if is_face else surfel
 
-    def _view(self, cells: list[Cell]) -> Float:
+    def _view(self, cells):
         """Sum of the unit vectors of the beams that ended in some cells."""
         ways = np.array([way for c in cells for way in self.ways[c]])
         return np.asarray((ways / np.linalg.norm(ways, axis=1, keepdims=True)).sum(axis=0))
 
-    def _span_share(self, cells: list[Cell]) -> float:
+    def _span_share(self, cells):
         """Mean hit span of some cells over that of all of them; 0 without time bins."""
         bins = [self.time_bins[c] for c in cells if c in self.time_bins]
         if not bins:
@@ -260,7 +247,7 @@ class SurfelMap:
         return float(np.mean(spans)) / (max(map(max, bins)) - min(map(min, bins)) + 1)
 
 
-def window_cells(cell: Cell, radius: int) -> list[Cell]:
+def window_cells(cell, radius):
     """Cells of the cube of some radius around a cell."""
     return list(product(*(range(c - radius, c + radius + 1) for c in cell)))
 

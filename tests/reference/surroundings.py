@@ -1,20 +1,15 @@
 """Surroundings of surfels: whether beams still ended beside a surfel while others passed it."""
 
-from collections.abc import Iterable, Mapping, Sequence
-
 from reference.observation import HIT
-from reference.surfel_map import Surfel
-
-Coarse = tuple[int, int, int]
 
 
-def coarse_cell(surfel: Surfel, edge: int) -> Coarse:
+def coarse_cell(surfel, edge):
     """The cell, `edge` cells wide, that a surfel lies in."""
     x, y, z = (int(v) // edge for v in surfel.cell)
     return x, y, z
 
 
-def surrounded(surfels: Sequence[Surfel], hits: Iterable[int], edge: int) -> set[int]:
+def surrounded(surfels, hits, edge):
     """The surfels in or beside whose coarse cell, level with it, one without a plane is hit."""
     rough = [surfels[k] for k in hits if surfels[k].plane is None]
     occupied = {
@@ -26,15 +21,13 @@ def surrounded(surfels: Sequence[Surfel], hits: Iterable[int], edge: int) -> set
     return {k for k, surfel in enumerate(surfels) if coarse_cell(surfel, edge) in occupied}
 
 
-def mark_misses(
-    seen: Mapping[int, float], surfels: Sequence[Surfel], edge: int
-) -> dict[int, tuple[float, bool]]:
+def mark_misses(seen, surfels, edge):
     """Observations of one time bin: HIT or reliability, and whether the surroundings were hit."""
     around = surrounded(surfels, [k for k, value in seen.items() if value == HIT], edge)
     return {k: (value, k in around) for k, value in seen.items()}
 
 
-def count_misses(history: Mapping[int, tuple[float, bool]]) -> tuple[float, float]:
+def count_misses(history):
     """Misses of a surfel, all and surrounded, by reliability; none one time bin from a hit.
 
     Args:

@@ -14,7 +14,7 @@ RELIABILITY, MIN_RELIABILITY, MARGIN = 0.9, 0.1, 1.5
 PI = np.float32(3.14159265)
 
 
-def arctan2(y: Float, x: Float) -> Float:
+def arctan2(y, x):
     """Abramowitz and Stegun, 4.4.49, in single precision: binned as by the kernel."""
     x, y = np.float32(x), np.float32(y)
     ax, ay = np.abs(x), np.abs(y)
@@ -32,7 +32,7 @@ def arctan2(y: Float, x: Float) -> Float:
 class RangeImage:
     """The shortest range in each pixel and around it; empty pixels: 0."""
 
-    def __init__(self, points: Float, pixel: tuple[float, float]) -> None:
+    def __init__(self, points, pixel):
         self.azimuth, self.elevation = np.float32(pixel[0]), np.float32(pixel[1])
         self.columns = int(np.ceil(np.float32(2.0) * PI / self.azimuth))
         up = self._elevation(points)
@@ -45,17 +45,17 @@ class RangeImage:
             rows = slice(max(r - 1, 0), r + 2)
             self.free[r, c] = min(image[rows, (c + k) % self.columns].min() for k in (-1, 0, 1))
 
-    def _elevation(self, points: Float) -> Float:
+    def _elevation(self, points):
         x, y, z = np.float32(points).T
         return arctan2(z, np.sqrt(x * x + y * y))
 
-    def _pixels(self, points: Float):
+    def _pixels(self, points):
         x, y, _ = np.float32(points).T
         row = np.floor((self._elevation(points) - self.lowest) / self.elevation).astype(int)
         column = ((arctan2(y, x) + PI) / self.azimuth).astype(int)
         return row, np.clip(column, 0, self.columns - 1)
 
-    def free_range(self, point: Float) -> float:
+    def free_range(self, point):
         row, column = (int(a[0]) for a in self._pixels(point[None]))
         return float(self.free[row, column]) if 0 <= row < len(self.free) else 0.0
 
@@ -72,7 +72,7 @@ class View:
 class SweepFilter3D(OccupancyFilter):
     """See the kernel."""
 
-    def __init__(self, resolution: float, **options) -> None:
+    def __init__(self, resolution, **options):
         super().__init__(resolution, **options)
         self.views: list[View] = []
         self.known_free = set[tuple[int, ...]]()
@@ -121,7 +121,7 @@ class SweepFilter3D(OccupancyFilter):
         last = passes[-1][1] if passes else -1
         return self._new_filter([r for r, _ in passes], last, tag)
 
-    def _visibility(self, view: View, cell) -> float:
+    def _visibility(self, view, cell):
         """P(the beams of a view met the surface of a cell if it stood there)."""
         T, edge = view.T_map_sensor, self.resolution
         p = T[:3, :3].T @ ((np.array(cell) + 0.5) * edge - T[:3, 3])

@@ -7,9 +7,7 @@ Float = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 
-def rasterise_texels(
-    corners: Float, width: int, height: int
-) -> tuple[Int32, Int32, NDArray[np.float32]]:
+def rasterise_texels(corners, width, height):
     """Texels (k,), triangles (k,), and barycentric weights (k, 2) of the second and third corner.
 
     A centre p is covered where p = a + j (b - a) + k (c - a) with j, k >= 0 and j + k <= 1.

@@ -1,9 +1,8 @@
 """TSDF integration (Curless and Levoy 1996)."""
 
-import numpy as np
-from numpy.typing import NDArray
+# ruff: noqa: ARG002  (threads: as the kernels have it)
 
-Float = NDArray[np.float64]
+import numpy as np
 
 _MARGIN = 0.01  # of a triangle
 _FLAT = 1e-12  # volume / product of the corner distances of a triangle seen edge-on
@@ -16,26 +15,18 @@ class TsdfVolume:
 
     block_edge = 8
 
-    def __init__(self, voxel: float, *, truncation_front: float, truncation_back: float) -> None:
+    def __init__(self, voxel, *, truncation_front, truncation_back):
         self.voxel = voxel
         self.truncation_front, self.truncation_back = truncation_front, truncation_back
         self._sums: dict[tuple[int, int, int], list[np.float32]] = {}
 
-    def integrate(
-        self,
-        points: Float,
-        origin: Float,
-        standoff: Float,
-        faces: NDArray[np.int32],
-        weight: NDArray[np.float32],
-        threads: int = 1,  # noqa: ARG002
-    ) -> None:
+    def integrate(self, points, origin, standoff, faces, weight, threads=1):
         """As `_core.TsdfVolume`."""
         for face, w in zip(faces, weight, strict=True):
             if w > 0.0:
                 self._add_triangle(points[face], origin[face].mean(axis=0), standoff[face], w)
 
-    def _add_triangle(self, corners: Float, o: Float, standoff: Float, w: np.float32) -> None:
+    def _add_triangle(self, corners, o, standoff, w):
         M = (corners - o).T
         volume, h = np.linalg.det(M), float(standoff.mean())
         if abs(volume) <= _FLAT * np.prod(np.linalg.norm(M, axis=0)) or h <= 0.0:
@@ -62,14 +53,12 @@ class TsdfVolume:
             sums[0] += s
             sums[1] += s * d
 
-    def blocks(self) -> NDArray[np.int64]:
+    def blocks(self):
         """(B, 3) blocks with integrated voxels, sorted."""
         cells = np.array(list(self._sums), np.int64).reshape(-1, 3)
         return np.unique(cells // self.block_edge, axis=0)
 
-    def dense(
-        self, first_cell: list[int], shape: list[int]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def dense(self, first_cell, shape):
         """[z, y, x] metres, NaN where unobserved, and weights."""
         metres, weight = np.full(shape, np.nan, np.float32), np.zeros(shape, np.float32)
         for cell, (w, product) in self._sums.items():

@@ -1,21 +1,9 @@
 """Rendering of a mesh by intersecting the ray of each pixel with every face."""
 
 import numpy as np
-from numpy.typing import NDArray
-
-Float = NDArray[np.float64]
 
 
-def render_z_buffer(
-    vertices: Float,
-    faces: NDArray[np.int32],
-    K: Float,
-    T_camera_map: Float,
-    width: int,
-    height: int,
-    *,
-    near: float,
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def render_z_buffer(vertices, faces, K, T_camera_map, width, height, *, near):
     """Depth (height, width), inf for background, and face, -1 for background.
 
     The ray z (x, y, 1) of a pixel meets a face a, b, c where z (x, y, 1) = i a + j b + k c with
@@ -38,7 +26,7 @@ def render_z_buffer(
     return depth, face
 
 
-def _ray_depths(rays: Float, a: Float, b: Float, c: Float) -> Float:
+def _ray_depths(rays, a, b, c):
     """Depths at which rays (h, w, 3) intersect a face, inf where they do not."""
     volume = float(np.dot(a, np.cross(b, c)))
     across = np.stack([rays @ np.cross(p, q) for p, q in ((b, c), (c, a), (a, b))], axis=-1)

@@ -4,29 +4,27 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from stillmap.sim import Simulation, scene_by_name, simulate
+from stillmap.sim import scene_by_name, simulate
 from stillmap.sim.laser import Returns
 from stillmap.sim.options import LaserOptions, RobotOptions
 from stillmap.sim.planar import FLOOR, Bumps, add_floor, find_blind_scans, simulate_bumps
 
-Float = NDArray[np.float64]
 EXACT = {"beams": 90, "range_noise": 0.0, "no_return_share": 0.0, "glass_no_return_share": 0.0}
 
 
-def hall(**changes: dict[str, object]) -> Simulation:
+def hall(**changes):
     usual = {"robot": {"scans": 300}, "crowd": {"people": 6}}
     sections = {**usual, **{k: {**usual.get(k, {}), **v} for k, v in changes.items()}}
     return simulate(scene_by_name("hall", sections), 2)
 
 
-def ranges(run: Simulation) -> Float:
+def ranges(run):
     r = np.hypot(*run.recording.points.T.astype(float))
     return r.reshape(run.recording.n_scans, -1)
 
 
-def test_pitch_is_a_half_wave() -> None:
+def test_pitch_is_a_half_wave():
     bumps = Bumps(np.array([1.0]), np.array([0.5]), np.array([[0.04, -0.01]]))
     tilt = bumps.tilt(np.array([0.9, 1.25, 1.0 + 0.5 / 6, 1.6]))
     np.testing.assert_allclose(tilt[1], [0.04, -0.01])
@@ -34,7 +32,7 @@ def test_pitch_is_a_half_wave() -> None:
     np.testing.assert_array_equal(tilt[[0, 3]], 0.0)
 
 
-def test_floor_ahead_is_a_line_across_the_pitch() -> None:
+def test_floor_ahead_is_a_line_across_the_pitch():
     bearing = np.radians([[0.0, 60.0, 120.0, -60.0]])
     none = np.full((1, 4), -1, np.int32)
     exact = Returns(np.full((1, 4), 9.0), np.zeros((1, 4), np.int32), none)
@@ -49,7 +47,7 @@ def test_floor_ahead_is_a_line_across_the_pitch() -> None:
     np.testing.assert_allclose(left.range[0, 1:3], 6.0 / math.sin(math.radians(60)))
 
 
-def test_bumps_come_at_their_rate() -> None:
+def test_bumps_come_at_their_rate():
     robot = np.column_stack([np.arange(4001) * 0.1, np.zeros((4001, 2))])
     options = RobotOptions(bump_rate=0.5, bump_pitch=0.06, bump_time=0.8)
     bumps = simulate_bumps(robot, np.arange(4001) * 0.2, options, np.random.default_rng(0))
@@ -61,7 +59,7 @@ def test_bumps_come_at_their_rate() -> None:
     np.testing.assert_array_equal(bumps.peak[:, 1], 0.0)
 
 
-def test_bumps_shorten_beams_only_and_the_floor_is_not_static() -> None:
+def test_bumps_shorten_beams_only_and_the_floor_is_not_static():
     plain = hall(laser=EXACT)
     bumpy = hall(laser=EXACT, robot={"bump_rate": 1.5})
     np.testing.assert_array_equal(plain.truth.T_world_base, bumpy.truth.T_world_base)
@@ -78,7 +76,7 @@ def test_bumps_shorten_beams_only_and_the_floor_is_not_static() -> None:
         assert np.ptp(x[scan, floor[scan]]) < 1e-4
 
 
-def test_blind_stretches_take_their_time() -> None:
+def test_blind_stretches_take_their_time():
     seconds = np.arange(2000) * 0.2
     options = LaserOptions(blind_stretches=4, blind_time=30.0, blind_at=0.1)
     blind = find_blind_scans(seconds, options, np.random.default_rng(5))
@@ -91,7 +89,7 @@ def test_blind_stretches_take_their_time() -> None:
     assert not find_blind_scans(seconds, LaserOptions(), np.random.default_rng(5)).any()
 
 
-def test_nothing_returns_in_a_blind_stretch() -> None:
+def test_nothing_returns_in_a_blind_stretch():
     plain = hall(laser={"beams": 60})
     run = hall(laser={"beams": 60, "blind_at": 0.5, "blind_time": 6.0, "blind_stretches": 1})
     hit = run.recording.hit.reshape(300, -1)

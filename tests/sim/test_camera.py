@@ -1,42 +1,37 @@
 """Cameras in simulated worlds: what they show, when and from where, and the truth about it."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from marks import slow_params
-from numpy.typing import NDArray
 from true_surfaces import place_parts, project_to_solid, project_to_static
 
 from stillmap import io as recordings
 from stillmap.core.camera import project
 from stillmap.core.errors import InputError
-from stillmap.sim import Scene, Simulation, scene_by_name, simulate, simulate_rig, write_rig
+from stillmap.sim import scene_by_name, simulate, simulate_rig, write_rig
 from stillmap.sim.camera import SKY, compute_pixel_rays, compute_static_color, place_cameras
 from stillmap.sim.options import CameraOptions
-from stillmap.sim.simulator import RigSimulation
 from stillmap.sim.truth import load_image_truth
-
-Float = NDArray[np.float64]
 
 SMALL = {"width": 96, "height": 72, "noise": 0.0}
 LENS = {"k1": -0.2, "k2": 0.05, "p1": 0.002, "p2": -0.001}
 
 
-def _scene(name: str, camera: dict[str, object], lidar: int = 8) -> Scene:
+def _scene(name, camera, lidar=8):
     sensors = {"channels": lidar, "columns": 60}
     looks = {"enabled": True, **SMALL, **camera}
     return scene_by_name(name, {"lidar": sensors, "robot": {"scans": 12}, "camera": looks})
 
 
 @pytest.fixture(scope="module")
-def street() -> Simulation:
+def street():
     return simulate(_scene("street", {"count": 2, **LENS}), 4)
 
 
 @pytest.fixture(scope="module")
-def rig() -> RigSimulation:
+def rig():
     changes = {
         "rig": {"tilts": True},
         "robot": {"scans": 60, "scan_rate": 37.5},
@@ -46,10 +41,8 @@ def rig() -> RigSimulation:
     return simulate_rig(scene_by_name("hall", changes), 2)
 
 
-def _seen(one: Simulation, image: int) -> tuple[Float, NDArray[np.uint16]]:
+def _seen(one, image):
     """(h, w, 3) where the pixels' rays end in the world, and the mask."""
-    assert one.photographs is not None
-    assert one.recording.images is not None
     shot, images = one.photographs.render(image), one.recording.images
     T = one.photographs.T_world_camera[image]
     rays = (
@@ -60,13 +53,9 @@ def _seen(one: Simulation, image: int) -> tuple[Float, NDArray[np.uint16]]:
 
 
 @pytest.mark.parametrize("which", [*slow_params("street"), "rig"])
-def test_pixels_show_the_true_surfaces_in_their_colours(
-    which: str, request: pytest.FixtureRequest
-) -> None:
+def test_pixels_show_the_true_surfaces_in_their_colours(which, request):
     made = request.getfixturevalue(which)
     one = made.tilting if which == "rig" else made
-    assert one.photographs is not None
-    assert one.recording.images is not None
     surfaces, movers = one.photographs.truth(), 0
     for image in range(len(one.recording.images)):
         places, mask = _seen(one, image)
@@ -89,10 +78,8 @@ def test_pixels_show_the_true_surfaces_in_their_colours(
     assert movers > 0
 
 
-def test_a_ring_of_cameras_looks_all_around_and_sees_the_sky(street: Simulation) -> None:
+def test_a_ring_of_cameras_looks_all_around_and_sees_the_sky(street):
     images = street.recording.images
-    assert images is not None
-    assert street.photographs is not None
     shot = street.photographs.render(0)
     assert np.array_equal(shot.mask == SKY, np.isinf(shot.distance))
     assert 0.1 < np.mean(shot.mask == SKY) < 0.7
@@ -106,7 +93,7 @@ def test_a_ring_of_cameras_looks_all_around_and_sees_the_sky(street: Simulation)
     assert images.stamp_ns[0] == images.stamp_ns[1] < images.stamp_ns[2]
 
 
-def test_the_lens_is_undone() -> None:
+def test_the_lens_is_undone():
     camera = place_cameras(CameraOptions(enabled=True, width=64, height=48, **LENS))[0]
     rays = compute_pixel_rays(camera)
     uv, _ = project(camera, rays.reshape(3, -1).T)
@@ -116,17 +103,17 @@ def test_the_lens_is_undone() -> None:
 
 
 @pytest.mark.parametrize("limit", [{"k1": -0.41}, {"k2": 0.41}, {"p1": 0.06}, {"fov": 2.7}])
-def test_lenses_that_bend_rays_back_are_refused(limit: dict[str, float]) -> None:
+def test_lenses_that_bend_rays_back_are_refused(limit):
     with pytest.raises(ValueError, match=r"less than|greater than"):
         CameraOptions(**limit)
 
 
-def test_a_lens_that_does_not_reach_the_corners_is_refused() -> None:
+def test_a_lens_that_does_not_reach_the_corners_is_refused():
     with pytest.raises(InputError, match="lens does not reach"):
         compute_pixel_rays(place_cameras(CameraOptions(enabled=True, k1=-0.4, fov=2.0))[0])
 
 
-def test_cameras_leave_everything_else_as_it_is() -> None:
+def test_cameras_leave_everything_else_as_it_is():
     with_camera = _scene("street", {})
     seen = simulate(with_camera, 4)
     blind = simulate(replace(with_camera, camera=CameraOptions()), 4)
@@ -140,25 +127,20 @@ def test_cameras_leave_everything_else_as_it_is() -> None:
     assert seen.truth.scene["camera"]["width"] == 96
 
 
-def test_pictures_are_the_same_however_often_they_are_read() -> None:
+def test_pictures_are_the_same_however_often_they_are_read():
     scene = _scene("street", {"noise": 5.0, "exposure": 0.2})
     images, others = simulate(scene, 4).recording.images, simulate(scene, 4).recording.images
-    assert images is not None
-    assert others is not None
     assert np.array_equal(images.read(1), images.read(1))
     assert np.array_equal(images.read(1), others.read(1))
     brightness = [float(images.read(image).mean()) for image in range(len(images))]
     assert max(brightness) > 1.05 * min(brightness)
 
 
-def test_folders_hold_pictures_and_their_truth(rig: RigSimulation, tmp_path: Path) -> None:
+def test_folders_hold_pictures_and_their_truth(rig, tmp_path):
     write_rig(rig, tmp_path / "rig")
     assert not (tmp_path / "rig/horizontal/images").exists()
     images = recordings.read(tmp_path / "rig/tilting").images
     truth, made = load_image_truth(tmp_path / "rig/tilting"), rig.tilting
-    assert images is not None
-    assert made.recording.images is not None
-    assert made.photographs is not None
     surfaces = made.photographs.truth()
     assert np.array_equal(images.read(2), made.recording.images.read(2))
     assert np.array_equal(truth.mask(2), surfaces.mask(2))

@@ -1,29 +1,22 @@
 """Doors: how a leaf swings, for whom it opens, onto whom it does not close, who sees it."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stillmap.core.config import override
-from stillmap.sim import Scene, Simulation, simulate
+from stillmap.sim import Scene, simulate
 from stillmap.sim.dynamics import Doors, split_into_segments
 from stillmap.sim.options import DoorOptions
 from stillmap.sim.planner import compute_segment_distance
 from stillmap.sim.scene import Door
 from stillmap.sim.walls import box
 
-Float = NDArray[np.float64]
-
 DOOR = Door((1.0, 2.0), 0.9, 0.0, np.pi / 2)
 NOBODY, NO_WAYS = np.empty((0, 2)), np.empty((0, 4))
 FAR = np.array([[20.0, 20.0]])
 
 
-def followed(
-    doors: Doors, steps: int, standing: Float = NOBODY, ways: Float = NO_WAYS, dt: float = 0.1
-) -> Float:
+def followed(doors, steps, standing=NOBODY, ways=NO_WAYS, dt=0.1):
     angles = []
     for _ in range(steps):
         doors.step(dt, standing, ways)
@@ -31,7 +24,7 @@ def followed(
     return np.array(angles)
 
 
-def until(state: float, seed: int = 0, options: DoorOptions | None = None) -> Doors:
+def until(state, seed=0, options=None):
     """A door that has just come to be closed (0) or open (1)."""
     doors = Doors((DOOR,), options or DoorOptions(), np.random.default_rng(seed))
     while doors.share[0] == state:
@@ -42,7 +35,7 @@ def until(state: float, seed: int = 0, options: DoorOptions | None = None) -> Do
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_leaf_swings_evenly_and_stays_as_long_as_it_may(seed: int) -> None:
+def test_a_leaf_swings_evenly_and_stays_as_long_as_it_may(seed):
     options = DoorOptions(min_open=4, max_open=9, min_closed=6, max_closed=20, swing=1.5)
     angle = followed(until(0.0, seed, options), 3000)[:, 0]
     assert angle.min() == pytest.approx(0.0)
@@ -66,7 +59,7 @@ def test_a_leaf_swings_evenly_and_stays_as_long_as_it_may(seed: int) -> None:
     np.testing.assert_allclose(spans[~rests], 1.5, atol=0.11)
 
 
-def test_a_closing_leaf_stops_for_somebody() -> None:
+def test_a_closing_leaf_stops_for_somebody():
     doors = until(1.0)
     while doors.share[0] == 1.0:
         doors.step(0.1, FAR, NO_WAYS)
@@ -75,7 +68,7 @@ def test_a_closing_leaf_stops_for_somebody() -> None:
     assert 0.0 < angle[0, 0] < np.pi / 2
 
 
-def test_a_door_opens_for_whoever_comes_but_not_for_who_goes_by() -> None:
+def test_a_door_opens_for_whoever_comes_but_not_for_who_goes_by():
     options = DoorOptions(min_closed=1000.0, max_closed=1000.0)
     standing = np.array([[1.4, 0.5]])
     by = split_into_segments(np.array([[[0.4, 1.0], [3.4, 1.0], [5.0, 1.0]]]))
@@ -85,12 +78,10 @@ def test_a_door_opens_for_whoever_comes_but_not_for_who_goes_by() -> None:
     assert followed(doors, 16, standing, through)[-1, 0] == pytest.approx(np.pi / 2)
 
 
-def standing_before_a_door(**doors: float) -> Simulation:
+def standing_before_a_door(**doors):
     walls = [*box(0, 0, 8, 8), (4.0, 0.5, 1.0, 0.5), (-4.0, 0.5, 0.0, 0.5)]
-    scene = Scene(
-        name="door", walls=tuple(walls), route=((0.5, -3.0), (0.5, -2.95)),
-        leaves=(Door((0.02, 0.5), 0.96, 0.0, 1.8),),
-    )  # fmt: skip
+    leaf, route = Door((0.02, 0.5), 0.96, 0.0, 1.8), ((0.5, -3.0), (0.5, -2.95))
+    scene = Scene(name="door", walls=tuple(walls), route=route, leaves=(leaf,))
     options = {
         "crowd": {"people": 0},
         "robot": {"scans": 600, "speed": 0.001},
@@ -100,9 +91,7 @@ def standing_before_a_door(**doors: float) -> Simulation:
     return simulate(override(scene, options), 2)
 
 
-def test_beams_meet_the_leaf_where_it_is(
-    end_points: Callable[[Simulation], tuple[Float, NDArray[np.int64]]],
-) -> None:
+def test_beams_meet_the_leaf_where_it_is(end_points):
     run = standing_before_a_door(max_closed=10.0, max_open=10.0)
     xy, scan = end_points(run)
     truth = run.truth

@@ -1,23 +1,17 @@
 """The drive through a town: a car that accelerates, waits at a light and slows down to turn."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from stillmap.sim import Simulation
 from stillmap.sim.options import RobotOptions
 from stillmap.sim.scene import Light
 from stillmap.sim.vehicles import SpeedProfile
-
-Float = NDArray[np.float64]
 
 STRAIGHT = np.stack([np.arange(0, 300.01, 0.05), np.zeros(6001)], axis=-1)
 CAR = RobotOptions(speed=15.0, acceleration=2.5)
 
 
-def driven(pace: SpeedProfile, steps: int, dt: float, way: Float = STRAIGHT) -> Float:
+def driven(pace, steps, dt, way=STRAIGHT):
     """(steps, 2) metres along the way and speed, from a standing start."""
     at, now, out = 0.0, 0.0, []
     for k in range(steps):
@@ -30,7 +24,7 @@ def driven(pace: SpeedProfile, steps: int, dt: float, way: Float = STRAIGHT) -> 
 
 
 @pytest.mark.parametrize("dt", [1 / 75, 0.1])
-def test_it_gains_speed_and_stops_at_a_red_light(dt: float) -> None:
+def test_it_gains_speed_and_stops_at_a_red_light(dt):
     light = Light((200.0, 0.0), (2.0, 40.0), 100.0)
     at, speed = driven(SpeedProfile(STRAIGHT, False, CAR, (light,)), round(60 / dt), dt).T
     gains = round(5.5 / dt)
@@ -43,7 +37,7 @@ def test_it_gains_speed_and_stops_at_a_red_light(dt: float) -> None:
     assert braking.min() > -2.5 * 1.6
 
 
-def test_whoever_cannot_stop_any_more_drives_on() -> None:
+def test_whoever_cannot_stop_any_more_drives_on():
     # at 15 m/s it takes 45 m to stop: 30 m before the line it turns red
     reaches = 15.0**2 / (2 * 2.5) + 15.0 * 8.0
     light = Light((reaches + 30.0, 0.0), (14.0, 60.0), 100.0)
@@ -51,7 +45,7 @@ def test_whoever_cannot_stop_any_more_drives_on() -> None:
     np.testing.assert_allclose(speed[70:], 15.0)
 
 
-def test_curves_are_taken_slowly_and_braked_for() -> None:
+def test_curves_are_taken_slowly_and_braked_for():
     turn = np.linspace(-np.pi / 2, 0, 315)
     arc = np.stack([100 + 10 * np.cos(turn), 10 + 10 * np.sin(turn)], axis=-1)
     lead = STRAIGHT[STRAIGHT[:, 0] < 100]
@@ -65,32 +59,31 @@ def test_curves_are_taken_slowly_and_braked_for() -> None:
     assert np.diff(speed).min() > -0.25 * 1.3
 
 
-def test_without_an_acceleration_it_drives_at_its_speed_at_once() -> None:
+def test_without_an_acceleration_it_drives_at_its_speed_at_once():
     way = np.concatenate([STRAIGHT[:200], STRAIGHT[200] + [[0.0, 0.05 * k] for k in range(200)]])
     pace = SpeedProfile(way, False, RobotOptions(speed=0.5), ())
     assert pace.accelerate(pace.limit_speed(100, 0.0, 0.0, 0.0, 0.1), 0.0, 0.1) == 0.5
     assert {pace.limit_speed(k, 0.0, 0.5, 0.0, 0.1) for k in range(len(way))} == {0.5}
 
 
-def test_a_light_is_red_again_after_a_cycle() -> None:
-    light = Light((0.0, 0.0), (10.0, 30.0), 50.0)
-    assert [light.is_red(t) for t in (0, 9.9, 10, 29.9, 30, 59.9, 60, 79.9, 80)] == [
-        False, False, True, True, False, False, True, True, False,
-    ]  # fmt: skip
-    over_the_end = Light((0.0, 0.0), (30.0, 60.0), 50.0)
-    assert [over_the_end.is_red(t) for t in (0, 9.9, 10, 29.9, 30)] == [
-        True, True, False, False, True,
-    ]  # fmt: skip
+@pytest.mark.parametrize(
+    ("red", "times"),
+    [((10.0, 30.0), (10, 29.9, 60, 79.9)), ((30.0, 60.0), (0, 9.9, 30))],  # over the end, too
+)
+def test_a_light_is_red_again_after_a_cycle(red, times):
+    light = Light((0.0, 0.0), red, 50.0)
+    every = (0, 9.9, 10, 29.9, 30) if red[0] == 30.0 else (0, 9.9, 10, 29.9, 30, 59.9, 60, 79.9, 80)
+    assert tuple(t for t in every if light.is_red(t)) == times
 
 
 @pytest.fixture
-def drive(run: Callable[[str], Simulation]) -> Simulation:
+def drive(run):
     """The whole route at 10 Hz."""
     return run("drive")
 
 
 @pytest.mark.slow
-def test_it_waits_at_the_light_until_it_is_green(drive: Simulation) -> None:
+def test_it_waits_at_the_light_until_it_is_green(drive):
     xy = drive.truth.T_world_base[:, :2, 2]
     speed = np.hypot(*np.diff(xy, axis=0).T) * 10
     assert 15.5 < speed.max() < 15.6 + 1e-6
@@ -103,7 +96,7 @@ def test_it_waits_at_the_light_until_it_is_green(drive: Simulation) -> None:
 
 
 @pytest.mark.slow
-def test_cars_do_not_run_red_lights(drive: Simulation) -> None:
+def test_cars_do_not_run_red_lights(drive):
     """No car crosses a stop line while it is red, but those too fast to stop."""
     at = drive.truth.movers[..., :2]
     lights = [(lane, light) for lane in drive.scene.lanes for light in lane.lights]
@@ -121,7 +114,7 @@ def test_cars_do_not_run_red_lights(drive: Simulation) -> None:
 
 
 @pytest.mark.slow
-def test_the_queue_at_the_corner_stands_while_it_is_seen(drive: Simulation) -> None:
+def test_the_queue_at_the_corner_stands_while_it_is_seen(drive):
     truth = drive.truth
     scan = np.repeat(np.arange(drive.recording.n_scans), np.diff(drive.recording.offset))
     for car in range(-drive.scene.lanes[-1].waiting, 0):

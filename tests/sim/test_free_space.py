@@ -9,7 +9,7 @@ from stillmap.sim.planner import FreeSpace, Planner, compute_segment_distance
 from stillmap.sim.walls import Opening, box, polyline, wall
 
 
-def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> None:
+def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit():
     walls = np.array([*box(5, 5, 10, 10), (4.0, 4.0, 6.0, 6.0)])
     xy = np.random.default_rng(0).uniform(0.3, 9.7, (500, 2))
     true = np.min([compute_segment_distance(xy, w) for w in walls], axis=0)
@@ -19,7 +19,7 @@ def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> No
     np.testing.assert_allclose(gradient[beside], [[1, 0]] * beside.sum(), atol=1e-9)
 
 
-def test_the_way_goes_around_a_wall_and_keeps_its_distance() -> None:
+def test_the_way_goes_around_a_wall_and_keeps_its_distance():
     walls = np.array([*box(5, 5, 10, 10), (5.0, 0.0, 5.0, 8.0)])
     start, end = np.array([2.0, 2.0]), np.array([8.0, 2.0])
     planner = Planner(FreeSpace(walls), start, 0.4)
@@ -32,7 +32,7 @@ def test_the_way_goes_around_a_wall_and_keeps_its_distance() -> None:
     assert min(compute_segment_distance(dense, w).min() for w in walls) > 0.3
 
 
-def test_only_the_part_that_can_be_reached_counts() -> None:
+def test_only_the_part_that_can_be_reached_counts():
     walls = np.array([*box(5, 5, 10, 10), *box(5, 5, 4, 4)])
     planner = Planner(FreeSpace(walls), np.array([1.0, 1.0]), 0.3)
     points = planner.point(planner.nodes)
@@ -41,7 +41,7 @@ def test_only_the_part_that_can_be_reached_counts() -> None:
     assert len(points) == pytest.approx((9.4**2 - 4.6**2) / 0.04, rel=0.1)
 
 
-def test_a_room_behind_an_open_door_can_be_entered_and_a_niche_cannot() -> None:
+def test_a_room_behind_an_open_door_can_be_entered_and_a_niche_cannot():
     door = Opening(4.0, is_open=True)
     walls = [*wall((0, 0), 10, "south", [door, Opening(7.0)]), *box(5, 5, 10, 10)[1:]]
     walls += polyline([(4, -0.2), (2, -0.2), (2, -3.2), (8, -3.2), (8, -0.2), (5, -0.2)])

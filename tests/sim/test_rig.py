@@ -1,7 +1,6 @@
 """A laser that lies flat and one that tilts: one world, one clock, two recordings."""
 
 import functools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,19 +9,17 @@ from stillmap import io as recordings
 from stillmap.core.errors import InputError
 from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.sim.options import RigOptions
-from stillmap.sim.simulator import RigSimulation
 
 
 @functools.cache
-def run(sweep_time: float = 0.0) -> RigSimulation:
+def run(sweep_time=0.0):
     laser = {"range_noise": 0.0, "no_return_share": 0.0, "sweep_time": sweep_time}
     robot = {"scans": 100, "scan_rate": 10.0}
-    return simulate_rig(
-        scene_by_name("hall", {"laser": laser, "robot": robot, "rig": {"tilts": True}}), 3
-    )
+    changes = {"laser": laser, "robot": robot, "rig": {"tilts": True}}
+    return simulate_rig(scene_by_name("hall", changes), 3)
 
 
-def test_both_have_the_same_clock_robot_and_movers() -> None:
+def test_both_have_the_same_clock_robot_and_movers():
     flat, tilting = run().horizontal, run().tilting
     assert (flat.recording.dimension, tilting.recording.dimension) == (2, 3)
     np.testing.assert_array_equal(flat.recording.stamp_ns, tilting.recording.stamp_ns)
@@ -31,13 +28,11 @@ def test_both_have_the_same_clock_robot_and_movers() -> None:
         (flat.truth.T_world_base, tilting.truth.T_world_base),
         (flat.recording.T_odom_base, tilting.recording.T_odom_base),
     ):
-        assert a is not None
-        assert b is not None
         np.testing.assert_allclose(a[:, :2, 2], b[:, :2, 3])
         np.testing.assert_allclose(a[:, :2, :2], b[:, :2, :2])
 
 
-def test_each_scan_is_a_plane_at_the_angle_of_its_joint() -> None:
+def test_each_scan_is_a_plane_at_the_angle_of_its_joint():
     recording, angle = run().tilting.recording, run().joint_angle
     points = recording.points.reshape(100, -1, 3)
     off = points[..., 2] * np.cos(angle)[:, None] + points[..., 0] * np.sin(angle)[:, None]
@@ -50,12 +45,10 @@ def test_each_scan_is_a_plane_at_the_angle_of_its_joint() -> None:
     np.testing.assert_allclose(angle[:40], angle[40:80], atol=1e-12)
 
 
-def test_floor_ceiling_and_walls_are_seen_in_3d() -> None:
+def test_floor_ceiling_and_walls_are_seen_in_3d(end_points):
     tilting = run().tilting
     recording, truth = tilting.recording, tilting.truth
-    scan = np.repeat(np.arange(100), np.diff(recording.offset))
-    T = recording.T_map_sensor(truth.T_world_base)[scan]
-    ends = np.einsum("nij,nj->ni", T[:, :3, :3], recording.points.astype(float)) + T[:, :3, 3]
+    ends, scan = end_points(tilting)
     z = ends[recording.hit, 2]
     assert z.min() > -1e-4
     assert z.max() < 6.0 + 1e-4
@@ -67,7 +60,7 @@ def test_floor_ceiling_and_walls_are_seen_in_3d() -> None:
     assert np.hypot(*(ends[person, :2] - at).T).max() < 0.6
 
 
-def test_a_folder_of_both(tmp_path: Path) -> None:
+def test_a_folder_of_both(tmp_path):
     write_rig(run(), tmp_path / "rig")
     for name, one in (("horizontal", run().horizontal), ("tilting", run().tilting)):
         read, truth = recordings.read(tmp_path / "rig" / name), load_truth(tmp_path / "rig" / name)

@@ -1,52 +1,41 @@
 """Lasers that hang upside down, and a second one that looks backwards."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stillmap import io
 from stillmap.core import se2
-from stillmap.sim import Simulation, scene_by_name, simulate, write_simulation
-
-Float = NDArray[np.float64]
-Distance = Callable[[Float, Float], Float]
-EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 
-def taken(beams: int = 61, scans: int = 60, name: str = "hall", **laser: object) -> Simulation:
+def taken(beams=61, scans=60, name="hall", **laser):
     exact = {"range_noise": 0.0, "no_return_share": 0.0, "glass_no_return_share": 0.0}
     changes = {"robot": {"scans": scans}, "laser": {"beams": beams, **exact, **laser}}
     return simulate(scene_by_name(name, changes), 6)
 
 
-def ranges_of(simulation: Simulation) -> Float:
+def ranges_of(simulation):
     T = simulation.recording.n_scans
     return np.hypot(*simulation.recording.points.T).reshape(T, -1).astype(float)
 
 
 @pytest.mark.parametrize("upside_down", ["known", "unknown"])
-def test_an_upside_down_laser_gives_its_beams_from_left_to_right(upside_down: str) -> None:
+def test_an_upside_down_laser_gives_its_beams_from_left_to_right(upside_down):
     upright, turned = taken(), taken(upside_down=upside_down)
     np.testing.assert_allclose(ranges_of(turned), ranges_of(upright)[:, ::-1], atol=1e-5)
     movers = turned.truth.mover.reshape(60, -1)
     np.testing.assert_array_equal(movers, upright.truth.mover.reshape(60, -1)[:, ::-1])
     assert (movers >= 0).any()
-
-
-def test_whoever_knows_it_sees_the_same_place() -> None:
-    upright, known = taken(), taken(upside_down="known")
-    points = known.recording.points.reshape(60, -1, 2)[:, ::-1]
-    np.testing.assert_allclose(points, upright.recording.points.reshape(60, -1, 2), atol=1e-5)
-    (sensor,) = known.recording.source.sensors
-    assert sensor.start_angle == pytest.approx(np.pi / 2)
-    assert sensor.angle_step == pytest.approx(-np.pi / 60)
+    if upside_down == "known":  # whoever knows it sees the same place
+        points = turned.recording.points.reshape(60, -1, 2)[:, ::-1]
+        np.testing.assert_allclose(points, upright.recording.points.reshape(60, -1, 2), atol=1e-5)
+        (sensor,) = turned.recording.source.sensors
+        found = sensor.start_angle, sensor.angle_step
+        assert found == pytest.approx((np.pi / 2, -np.pi / 60))
 
 
 @pytest.mark.parametrize("sweep_time", [0.0, 0.2])
-def test_a_second_laser_looks_backwards_by_turns(sweep_time: float) -> None:
+def test_a_second_laser_looks_backwards_by_turns(sweep_time):
     run = taken(second_laser=True, sweep_time=sweep_time, scans=100)
     r = run.recording
     np.testing.assert_array_equal(r.sensor, np.arange(100) % 2)
@@ -57,9 +46,7 @@ def test_a_second_laser_looks_backwards_by_turns(sweep_time: float) -> None:
     assert [s.name for s in r.source.sensors] == ["simulated laser", "simulated rear laser"]
 
 
-def test_hits_of_both_lasers_lie_on_the_walls(
-    wall_distance: Distance, end_points: EndPoints
-) -> None:
+def test_hits_of_both_lasers_lie_on_the_walls(wall_distance, end_points):
     run = taken(second_laser=True, scans=200)
     xy, scan = end_points(run)
     static = run.truth.static
@@ -73,7 +60,7 @@ def test_hits_of_both_lasers_lie_on_the_walls(
     assert set(run.recording.sensor[scan[hit]]) == {0, 1}
 
 
-def test_two_lasers_survive_as_a_carmen_log(tmp_path: Path) -> None:
+def test_two_lasers_survive_as_a_carmen_log(tmp_path):
     run = taken(60, second_laser=True)
     write_simulation(run, tmp_path / "sim", format="carmen")
     log, own = io.read(tmp_path / "sim/recording.log"), run.recording

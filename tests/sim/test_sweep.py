@@ -1,49 +1,28 @@
 """Scans that take time: each beam shows the world as it was when the beam was taken."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.config import override
-from stillmap.sim import Scene, Simulation, simulate
+from stillmap.sim import Scene, simulate
 from stillmap.sim.dynamics import Motion
 from stillmap.sim.laser import Movers, Outlines
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.planar import Sweep, cast_sweeps
-from stillmap.sim.walls import box, pillar
-
-Float = NDArray[np.float64]
-Distance = Callable[[Float, Float], Float]
-EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
+from stillmap.sim.walls import box
 
 NOTHING = Movers(np.empty((2, 0, 2)), np.empty((2, 0)), np.empty((0, 2)), np.empty(0, np.int32))
 EXACT = {"range_noise": 0.0, "no_return_share": 0.0}
 
 
-def yard(sweep_time: float, people: int = 0) -> Simulation:
-    """A robot that drives round and turns on the spot among pillars."""
-    walls = [*box(0, 0, 14, 10), *pillar(0.5, 0.3, 0.6), *pillar(-3, 2.5, 0.2)]
-    route = ((-4.0, -3.0), (4.0, -3.0), (4.0, 3.0), (-4.0, -2.0))
-    scene = Scene(name="yard", walls=tuple(walls), route=route)
-    changes = {
-        "laser": {"beams": 90, "sweep_time": sweep_time, **EXACT},
-        "robot": {"scans": 250, "speed": 1.5, "turn_rate": 2.0},
-        "crowd": {"people": people, "min_speed": 1.5, "stopping_share": 0.0},
-    }
-    return simulate(override(scene, changes), 2)
-
-
-def at_beam_times(simulation: Simulation) -> tuple[Float, Float, Float]:
+def at_beam_times(simulation):
     """True sensor poses x, y, theta at each beam's time, which scan it is of, and when in it."""
     recording = simulation.recording
     T = recording.T_map_sensor(simulation.truth.T_world_base)
     x, y, theta = se2.parameters(T).T
     beams = recording.n_beams // recording.n_scans
     later = np.repeat(np.arange(recording.n_scans), beams)
-    assert recording.beam_time is not None
     when = later + recording.beam_time * simulation.scene.robot.scan_rate
     scans = np.arange(recording.n_scans)
     poses = [np.interp(when, scans, values) for values in (x, y, np.unwrap(theta))]
@@ -53,9 +32,10 @@ def at_beam_times(simulation: Simulation) -> tuple[Float, Float, Float]:
 
 @pytest.mark.parametrize("sweep_time", [0.2, 0.07])
 def test_hits_lie_on_the_walls_seen_from_where_the_laser_was(
-    sweep_time: float, wall_distance: Distance, end_points: EndPoints
-) -> None:
-    run = yard(sweep_time)
+    sweep_time, wall_distance, end_points, yard
+):
+    laser = {"beams": 90, "sweep_time": sweep_time, **EXACT}
+    run = yard(robot={"scans": 250}, laser=laser)
     poses, scan, _ = at_beam_times(run)
     use = run.recording.hit & (scan < run.recording.n_scans - 1)
     T, points = se2.matrix(*poses.T), run.recording.points
@@ -67,8 +47,9 @@ def test_hits_lie_on_the_walls_seen_from_where_the_laser_was(
     assert np.quantile(off, 0.9) > 0.3 * sweep_time * 1.5
 
 
-def test_people_are_where_they_are_at_the_beam_time() -> None:
-    run = yard(0.2, people=6)
+def test_people_are_where_they_are_at_the_beam_time(yard):
+    laser = {"beams": 90, "sweep_time": 0.2, **EXACT}
+    run = yard(people=6, robot={"scans": 250}, laser=laser)
     poses, scan, when = at_beam_times(run)
     hit = np.flatnonzero((run.truth.mover >= 0) & (scan < run.recording.n_scans - 1))
     T = se2.matrix(*poses[hit].T)
@@ -87,7 +68,7 @@ def test_people_are_where_they_are_at_the_beam_time() -> None:
 
 @pytest.mark.parametrize("beams", [2, 3, 90, 181, 361])
 @pytest.mark.parametrize("fov", [np.pi, 2 * np.pi])
-def test_beam_times_grow_with_the_angle(beams: int, fov: float) -> None:
+def test_beam_times_grow_with_the_angle(beams, fov):
     options = LaserOptions(beams=beams, fov=fov, sweep_time=0.1)
     times = Sweep.of(options).beam_times(beams).astype(float)
     assert times.shape == (beams,)
@@ -99,7 +80,7 @@ def test_beam_times_grow_with_the_angle(beams: int, fov: float) -> None:
     assert times.mean() == pytest.approx(exact.mean(), abs=1e-6)
 
 
-def standing_before(faces: Float) -> Motion:
+def standing_before(faces):
     """A robot that stands still for two scans, 0.2 s apart, before faces (2, 1, 4)."""
     return Motion(
         period=0.2,
@@ -119,7 +100,7 @@ def standing_before(faces: Float) -> Motion:
     )
 
 
-def test_beams_of_a_sweep_meet_what_comes_by_meanwhile() -> None:
+def test_beams_of_a_sweep_meet_what_comes_by_meanwhile():
     """A wall that comes nearer at 5 m/s, seen by a laser that stands still."""
     near = np.array([[[10.0, -50, 10, 50]], [[9.0, -50, 9, 50]]])
     motion = standing_before(near)
@@ -132,7 +113,7 @@ def test_beams_of_a_sweep_meet_what_comes_by_meanwhile() -> None:
     assert (returns.mover == 0).all()
 
 
-def test_a_robot_that_is_carried_away_is_not_seen_to_move() -> None:
+def test_a_robot_that_is_carried_away_is_not_seen_to_move():
     """The last scan before goes on as it began, and so does the first one after."""
     walls = tuple(box(0, 0, 40, 30))
     scene = Scene(name="yard", walls=walls, route=((-15.0, -10.0), (15.0, -10.0), (15.0, 10.0)))

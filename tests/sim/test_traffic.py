@@ -2,13 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stillmap.sim.options import TrafficOptions
 from stillmap.sim.scene import Lane, Light
 from stillmap.sim.vehicles import Traffic
-
-Float = NDArray[np.float64]
 
 FAR = np.array([0.0, 1000.0])
 STRAIGHT = Lane(((0.0, 0.0), (300.0, 0.0)))
@@ -16,7 +13,7 @@ RING = Lane(tuple((30 * np.cos(a), 30 * np.sin(a)) for a in np.linspace(0, 2 * n
 RING = Lane((*RING.path, RING.path[0]))
 
 
-def driven(traffic: Traffic, steps: int, robot: Float = FAR) -> Float:
+def driven(traffic, steps, robot=FAR):
     poses = []
     for _ in range(steps):
         poses.append(traffic.poses())
@@ -24,12 +21,12 @@ def driven(traffic: Traffic, steps: int, robot: Float = FAR) -> Float:
     return np.array(poses)
 
 
-def traffic(lane: Lane, seed: int = 0, **options: float) -> Traffic:
+def traffic(lane, seed=0, **options):
     return Traffic((lane,), TrafficOptions(**options), np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_on_one_lane_nobody_touches(seed: int) -> None:
+def test_on_one_lane_nobody_touches(seed):
     busy = traffic(RING, seed, vehicles=10, stopping_share=0.5, min_speed=3.0, max_speed=12.0)
     poses = driven(busy, 2000)
     gap = np.hypot(*np.moveaxis(poses[:, :, None, :2] - poses[:, None, :, :2], -1, 0))
@@ -47,7 +44,7 @@ def test_on_one_lane_nobody_touches(seed: int) -> None:
     assert np.abs(off).max() < 0.05
 
 
-def test_it_brakes_for_the_robot_on_its_lane() -> None:
+def test_it_brakes_for_the_robot_on_its_lane():
     one = traffic(STRAIGHT, 1, vehicles=1, stopping_share=0.0)
     robot = np.array([250.0, 0.3])
     poses = driven(one, 600, robot)[:, 0]
@@ -59,7 +56,7 @@ def test_it_brakes_for_the_robot_on_its_lane() -> None:
     assert beside[-1, 0, 0] > 255.0
 
 
-def test_a_queue_waits_for_the_robot_and_then_drives_off_one_by_one() -> None:
+def test_a_queue_waits_for_the_robot_and_then_drives_off_one_by_one():
     lane = Lane(STRAIGHT.path, waiting=4, stop=100.0, go=(60.0, 50.0))
     queue = traffic(lane, vehicles=7, stopping_share=0.0)
     assert queue.kinds == ["car"] * 4
@@ -76,7 +73,7 @@ def test_a_queue_waits_for_the_robot_and_then_drives_off_one_by_one() -> None:
     assert going[-1, -1, 0] > 110.0
 
 
-def test_it_stops_at_a_red_light_and_goes_on_when_it_is_green() -> None:
+def test_it_stops_at_a_red_light_and_goes_on_when_it_is_green():
     lane = Lane(STRAIGHT.path, lights=(Light((150.0, 0.0), (0.0, 40.0), 200.0),))
     two = traffic(lane, 1, vehicles=2, stopping_share=0.0, min_speed=9.0, max_speed=9.0)
     poses = driven(two, 600)[..., 0]
@@ -90,7 +87,7 @@ def test_it_stops_at_a_red_light_and_goes_on_when_it_is_green() -> None:
     assert front[401:600].max() > 200.0
 
 
-def test_whoever_cuts_in_is_not_run_over() -> None:
+def test_whoever_cuts_in_is_not_run_over():
     one = traffic(STRAIGHT, 1, vehicles=1, stopping_share=0.0, min_speed=12.0, max_speed=12.0)
     start = driven(one, 5)[-1, 0, 0]
     robot = np.array([start + 12.0, 0.0])  # too near to stop at any braking

@@ -1,38 +1,36 @@
 """The worlds: truth holds in all of them, with any sensor, and the empty ones are empty."""
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from marks import slow_params
-from numpy.typing import NDArray
 
-from stillmap.sim import SCENES, Simulation, scene_by_name, simulate
+from stillmap.sim import SCENES, scene_by_name, simulate
 from stillmap.sim.dynamics import place_faces
+from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Ground
+from stillmap.sim.walls import box
+from stillmap.sim.world_3d import make_static_world, trace_loops
 
-Float = NDArray[np.float64]
-Distance = Callable[[Float, Float], Float]
-EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
-
+OUTER = 5.25  # m, from the middle of the road to that of the outer lane
 BARE = [name for name in SCENES if name.endswith("-empty")]
 POPULATED = [name for name in SCENES if not name.endswith(("-empty", "-crowd"))]
 
 
-def largest_slow(names: list[str]) -> list[object]:
+def largest_slow(names):
     """The names; the kilometre of the drive is slow."""
     large = [name for name in names if name.startswith("drive")]
     return [*(name for name in names if name not in large), *slow_params(*large)]
 
 
-def kinds(simulation: Simulation) -> NDArray[np.str_]:
+def kinds(simulation):
     return np.array(simulation.truth.scene["mover_kinds"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", largest_slow(BARE))
-def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str) -> None:
+def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name):
     # else mirrors show the robot to itself
     laser = {"beams": 90, "mirror_return_share": 1.0}
     run = simulate(scene_by_name(name, {"robot": {"scans": 60}, "laser": laser}), 1)
@@ -49,12 +47,9 @@ def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str
 @pytest.mark.parametrize(
     ("beams", "degrees", "noise", "max_range"), [(1440, 360, 0.05, 5.0), (181, 90, 0.01, 80.0)]
 )
-def test_every_world_with_extreme_sensors(
-    name: str, beams: int, degrees: int, noise: float, max_range: float
-) -> None:
-    laser = {
-        "beams": beams, "fov": math.radians(degrees), "range_noise": noise, "max_range": max_range,
-    }  # fmt: skip
+def test_every_world_with_extreme_sensors(name, beams, degrees, noise, max_range):
+    laser = {"beams": beams, "fov": math.radians(degrees)}
+    laser |= {"range_noise": noise, "max_range": max_range}
     run = simulate(scene_by_name(name, {"laser": laser, "robot": {"scans": 8}}), 1)
     assert run.recording.n_beams == 8 * beams
     ranges = np.hypot(*run.recording.points.T)
@@ -64,16 +59,14 @@ def test_every_world_with_extreme_sensors(
 
 
 @pytest.mark.slow
-def test_static_hits_lie_on_what_stands_still(
-    world: Simulation, end_points: EndPoints, wall_distance: Distance
-) -> None:
+def test_static_hits_lie_on_what_stands_still(world, end_points, wall_distance):
     xy, _ = end_points(world)
     static = np.flatnonzero(world.truth.static)
     some = static[:: max(1, len(static) // 2000)]
     assert wall_distance(xy[some], world.truth.walls).max() < 1e-4
 
 
-def test_hits_on_movers_lie_on_that_mover(world: Simulation, end_points: EndPoints) -> None:
+def test_hits_on_movers_lie_on_that_mover(world, end_points):
     xy, scan = end_points(world)
     truth = world.truth
     hit = np.flatnonzero(truth.mover >= 0)
@@ -97,7 +90,7 @@ def test_hits_on_movers_lie_on_that_mover(world: Simulation, end_points: EndPoin
         assert np.all((u > 0.94 * length / 2 - 1e-4) | (v > 0.94 * width / 2 - 1e-4))
 
 
-def test_whoever_moves_is_not_labelled_static(world: Simulation) -> None:
+def test_whoever_moves_is_not_labelled_static(world):
     truth = world.truth
     np.testing.assert_array_equal(world.recording.hit, truth.static | (truth.mover >= 0))
     moved = np.ptp(truth.movers, axis=0).max(axis=1) > 1e-6
@@ -109,7 +102,7 @@ def test_whoever_moves_is_not_labelled_static(world: Simulation) -> None:
     assert still == np.sum(stays == "door") + 4 * np.sum((stays == "car") | (stays == "forklift"))
 
 
-def test_the_robot_meets_nobody(world: Simulation) -> None:
+def test_the_robot_meets_nobody(world):
     robot, radius = world.truth.T_world_base[:, :2, 2], world.scene.robot.radius
     off = np.hypot(*np.moveaxis(world.truth.movers[..., :2] - robot[:, None], -1, 0))
     kind = kinds(world)
@@ -119,7 +112,7 @@ def test_the_robot_meets_nobody(world: Simulation) -> None:
 
 
 @pytest.mark.slow
-def test_rounds_lead_through_every_corridor_and_home() -> None:
+def test_rounds_lead_through_every_corridor_and_home():
     run = simulate(scene_by_name("rounds-empty", {"laser": {"beams": 8}}), 1)
     xy = run.truth.T_world_base[:, :2, 2]
     X, Y = (1.4, 48.2, 113.0, 195.8), (1.4, 34.2, 81.0)  # m, the corridors' middles
@@ -136,7 +129,7 @@ def test_rounds_lead_through_every_corridor_and_home() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["office-moved", "street-moved", "warehouse-moved"])
-def test_moved_things_are_seen_wherever_they_stay(name: str, wall_distance: Distance) -> None:
+def test_moved_things_are_seen_wherever_they_stay(name, wall_distance):
     run = simulate(scene_by_name(name), 3)
     seconds = 1e-9 * (run.recording.stamp_ns - run.recording.stamp_ns[0])
     when = np.repeat(seconds, np.diff(run.recording.offset))
@@ -149,3 +142,32 @@ def test_moved_things_are_seen_wherever_they_stay(name: str, wall_distance: Dist
             # and they stand in no wall
             corners = place_faces(thing, stay)[:, :2]
             assert wall_distance(corners, run.truth.walls).min() > 0.02
+
+
+def test_crowns_reach_above_the_road_and_over_who_passes():
+    scene = scene_by_name("crossing")
+    ground = Ground(np.zeros(2), np.reshape(scene.pavements, (-1, 4)), scene.ground.kerb)
+    solids = make_static_world(scene, ground).solids
+    crowns = solids.form == ELLIPSOID
+    x, y, _, foot = solids.pose[0, crowns].T
+    assert crowns.sum() >= 15
+    assert (np.abs(y) - solids.half[crowns, 1] < OUTER).sum() >= 8
+    assert (np.abs(x) - solids.half[crowns, 0] < OUTER - 0.9).sum() >= 4  # above the cars
+    assert (solids.z[crowns, 0] + foot > 2.2).all()
+    trunks = solids.form == CYLINDER
+    np.testing.assert_allclose(solids.pose[0, trunks, :2], np.stack([x, y], axis=-1))
+    assert (solids.form == BOX).sum() > 10 * 6  # parked cars
+
+
+def test_an_outline_is_a_thing_if_it_closes_and_is_no_room():
+    def shifted(segments):
+        return [tuple(v + 3.0 for v in s) for s in segments]
+
+    square = box(0.5, 1.0, 1.0, 2.0)
+    room = [tuple(9.0 * v for v in s) for s in square]
+    loops, lines = trace_loops([*square, *room, *shifted(square)[:3]])
+    assert len(loops) == 1
+    assert loops[0][:2] == (0.5, 1.0)
+    assert loops[0].heading == pytest.approx(np.pi / 2)
+    assert (loops[0].length, loops[0].width, loops[0].sides) == (2.0, 1.0, 4)
+    assert len(lines) == 7

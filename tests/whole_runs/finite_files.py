@@ -3,8 +3,6 @@
 import json
 import math
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -12,42 +10,42 @@ import yaml
 _MAY_BE_NAN = {"p_occupied", "p_static", "speed"}
 
 
-def require_finite(folder: Path) -> None:
+def require_finite(folder):
     """Raises AssertionError for the first number that is none."""
     for path in sorted(folder.rglob("*")):
         if path.is_file():
             _CHECKS.get(path.suffix, _pass)(path)
 
 
-def _pass(path: Path) -> None:
+def _pass(path):
     assert path.stat().st_size, path
 
 
-def _json(path: Path) -> None:
-    def refuse(word: str) -> None:
+def _json(path):
+    def refuse(word):
         raise AssertionError(f"{path.name}: {word}")
 
     json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
 
 
-def _array(name: str, array: Any) -> None:
+def _array(name, array):
     if array.dtype.kind != "f":
         return
     bad = np.isinf(array) if name in _MAY_BE_NAN else ~np.isfinite(array)
     assert not bad.any(), f"{name}: {array[bad][:3]}"
 
 
-def _npy(path: Path) -> None:
+def _npy(path):
     _array(path.stem, np.load(path))
 
 
-def _npz(path: Path) -> None:
+def _npz(path):
     with np.load(path) as file:
         for name in file.files:
             _array(name, file[name])
 
 
-def _words(path: Path) -> None:
+def _words(path):
     for word in path.read_text(encoding="utf-8").split():
         try:
             number = float(word)
@@ -56,12 +54,12 @@ def _words(path: Path) -> None:
         assert math.isfinite(number), path
 
 
-def _yaml(path: Path) -> None:
+def _yaml(path):
     for value in np.ravel(list(_leaves(yaml.safe_load(path.read_text(encoding="utf-8"))))):
         assert not isinstance(value, float) or math.isfinite(value), path
 
 
-def _leaves(value: Any) -> Any:
+def _leaves(value):
     if isinstance(value, dict | list):
         for one in value.values() if isinstance(value, dict) else value:
             yield from _leaves(one)
@@ -69,7 +67,7 @@ def _leaves(value: Any) -> Any:
         yield value
 
 
-def _ply(path: Path) -> None:
+def _ply(path):
     head, _, body = path.read_bytes().partition(b"end_header\n")
     types = {b"float": "<f4", b"double": "<f8", b"uchar": "u1", b"int": "<i4"}
     columns = re.findall(rb"property (\w+) (\w+)", head)
@@ -79,7 +77,7 @@ def _ply(path: Path) -> None:
         _array(f"{path.name} {name}", rows[name])
 
 
-def _html(path: Path) -> None:
+def _html(path):
     text = re.sub(r"<(script|style)\b.*?</\1>", "", path.read_text(encoding="utf-8"), flags=re.S)
     assert not re.search(r"(?i)>[^<>]*\b(nan|inf|infinity)\b[^<>]*<", text), path
 

@@ -3,7 +3,6 @@ stamps in any order, few beams or very many, and the files that hold them."""
 
 import json
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,10 +66,10 @@ class OddRecording:
     notes: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def dimension(self) -> int:
+    def dimension(self):
         return int(self.directions.shape[1])
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return (
             f"<{self.dimension}D as {self.form}, scans of {list(self.counts)} beams, stamps "
             f"{list(self.stamp_ns)}, odometry {self.odometry is not None}, poses "
@@ -80,7 +79,7 @@ class OddRecording:
 
 
 @st.composite
-def odd_recordings(draw: Any, far: float = FAR) -> OddRecording:
+def odd_recordings(draw, far=FAR):
     """A robot that drives through a room, with up to four faults."""
     D = draw(st.sampled_from([2, 2, 3]))
     form = draw(st.sampled_from(["arrays", "folder", "log"] if D == 2 else ["arrays", "folder"]))
@@ -109,7 +108,7 @@ def odd_recordings(draw: Any, far: float = FAR) -> OddRecording:
     return one
 
 
-def _drive(rng: Any, D: int, counts: Any, form: str) -> OddRecording:
+def _drive(rng, D, counts, form):
     """A drive through a box as it should be."""
     T, M = len(counts), int(counts.sum())
     half = rng.uniform(2.0, 15.0, D)
@@ -149,13 +148,13 @@ def _drive(rng: Any, D: int, counts: Any, form: str) -> OddRecording:
     )
 
 
-def _moved(poses: Any, metres: float) -> Any:
+def _moved(poses, metres):
     out = poses.copy()
     out[:, :-1, -1] += metres
     return out
 
 
-def _stamps(draw: Any, T: int) -> Any:
+def _stamps(draw, T):
     kind = draw(st.sampled_from([*["even"] * 4, "equal", "apart", "sorted", "any"]))
     if kind in ("even", "equal"):
         first = draw(st.sampled_from([0, 10**18]))
@@ -168,7 +167,7 @@ def _stamps(draw: Any, T: int) -> Any:
     return np.array(sorted(some) if kind == "sorted" else some, np.int64)
 
 
-def _spoil(draw: Any, one: OddRecording, far: float) -> None:
+def _spoil(draw, one, far):
     """Put an odd value into some rows of one array."""
     names = [*["ranges"] * 3, "directions", "odometry", "poses", "beam_time", "mounts"]
     name = draw(st.sampled_from([n for n in names if getattr(one, n) is not None]))
@@ -193,7 +192,7 @@ def _spoil(draw: Any, one: OddRecording, far: float) -> None:
     one.notes["faults"].append((name, rows.start, rows.stop, value))
 
 
-def to_recording(one: OddRecording) -> stillmap.Recording:
+def to_recording(one):
     """The recording, by its constructors.
 
     Raises:
@@ -205,11 +204,7 @@ def to_recording(one: OddRecording) -> stillmap.Recording:
         angles = np.arctan2(*one.directions[:n, ::-1].T)
         step = 0.0 if one.beam_time is None or not n else float(one.beam_time[0])
         return stillmap.Recording.from_scans(
-            one.stamp_ns,
-            one.ranges.reshape(T, n),
-            angles,
-            one.odometry,
-            time_increment=step,
+            one.stamp_ns, one.ranges.reshape(T, n), angles, one.odometry, time_increment=step
         )
     ends = np.cumsum(one.counts)[:-1]
     with np.errstate(all="ignore"):
@@ -220,7 +215,7 @@ def to_recording(one: OddRecording) -> stillmap.Recording:
     )
 
 
-def write(one: OddRecording, folder: Path) -> Path:
+def write(one, folder):
     """The files of a recording, written without any check; returns the path to read."""
     if one.form == "log":
         path = folder / "odd.log"
@@ -260,7 +255,7 @@ def write(one: OddRecording, folder: Path) -> Path:
     return path
 
 
-def _log_lines(one: OddRecording) -> list[str]:
+def _log_lines(one):
     n = int(one.counts[0])
     T = one.odometry if one.odometry is not None else np.tile(np.eye(3), (len(one.counts), 1, 1))
     lines = []
@@ -273,7 +268,7 @@ def _log_lines(one: OddRecording) -> list[str]:
     return lines
 
 
-def write_poses(one: OddRecording, path: Path) -> None:
+def write_poses(one, path):
     """The poses as a TUM trajectory, likewise."""
     D, lines = one.dimension, []
     for stamp, T in zip(one.stamp_ns.tolist(), one.poses, strict=True):

@@ -8,14 +8,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from finite_files import require_finite
 from hypothesis import HealthCheck, given, settings
-from odd_recordings import OddRecording, odd_recordings, to_recording, write, write_poses
+from odd_recordings import odd_recordings, to_recording, write, write_poses
 
 import stillmap
 from stillmap.cli.main import main
@@ -58,7 +57,7 @@ def runs(count):
     )
 
 
-def read_status(text: str, name: str) -> int:
+def read_status(text, name):
     """Bytes, of a line of the status of a process."""
     return 1024 * int(text.partition(f"{name}:")[2].split()[0])
 
@@ -68,12 +67,12 @@ class TooSlow(BaseException):
 
 
 @contextmanager
-def bounds() -> Iterator[None]:
+def bounds():
     """Limits what a run takes of memory and time."""
     now = read_status(Path("/proc/self/status").read_text(), "VmData")
     before = resource.getrlimit(resource.RLIMIT_DATA)
 
-    def stop(*_: object) -> None:
+    def stop(*_):
         raise TooSlow
 
     handler = signal.signal(signal.SIGPROF, stop)
@@ -88,7 +87,7 @@ def bounds() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
-def run_in_python(one: OddRecording, folder: Path) -> None:
+def run_in_python(one, folder):
     try:
         recording = to_recording(one)
     except ValueError:
@@ -109,13 +108,13 @@ def run_in_python(one: OddRecording, folder: Path) -> None:
     repr(result), result._repr_html_(), repr(saved)
 
 
-def estimator_of(words: tuple[str, ...]) -> str:
+def estimator_of(words):
     if "--paper" in words:
         return "paper"
     return words[-1] if "--estimator" in words else "stillmap"
 
 
-def run_commands(one: OddRecording, folder: Path, said: pytest.CaptureFixture[str]) -> None:
+def run_commands(one, folder, said):
     path, out = write(one, folder), folder / "map"
     words = ["map", str(path), "-o", str(out), *_OPTIONS, *one.words]
     if one.poses is not None:
@@ -132,7 +131,7 @@ def run_commands(one: OddRecording, folder: Path, said: pytest.CaptureFixture[st
             )
 
 
-def succeeds(words: list[str], said: pytest.CaptureFixture[str]) -> bool:
+def succeeds(words, said):
     """Runs a command: it ends well, or refuses in one line and leaves nothing."""
     output = Path(words[words.index("-o") + 1])
     said.readouterr()
@@ -149,7 +148,7 @@ def succeeds(words: list[str], said: pytest.CaptureFixture[str]) -> bool:
     return False
 
 
-def require_run(one: OddRecording, said: pytest.CaptureFixture[str]) -> None:
+def require_run(one, said):
     with tempfile.TemporaryDirectory() as name, bounds():
         if one.form == "arrays":
             run_in_python(one, Path(name))
