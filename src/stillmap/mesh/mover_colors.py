@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from stillmap.core import arrays
-from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import is_in_image, project
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
@@ -21,26 +21,14 @@ from stillmap.mesh.inputs import (
     boxes_at,
     occlusion_probability,
 )
-from stillmap.mesh.place import (
-    CANDIDATES,
-    Background,
-    ViewAssignment,
-    resolve_assignment,
-    sample_buffer,
-)
+from stillmap.mesh.place import CANDIDATES, Background, ViewAssignment, resolve_assignment
 from stillmap.mesh.reconstruction import IMAGE_WINDOW, ObjectShape
 from stillmap.mesh.returns import DynamicReturns
 from stillmap.mesh.texture import GRAY, TexturedMesh, TextureSampler, avoid_gray, sample_bilinear
-from stillmap.mesh.triangle_mesh import Image, Mesh, Tell, no_tell, subdivide
+from stillmap.mesh.triangle_mesh import Image, Tell, no_tell, subdivide
 from stillmap.mesh.view_selection import MIN_P_VISIBLE, NONE, Candidates, view_utility
 from stillmap.mesh.views import View
-from stillmap.mesh.visibility import (
-    DEPTH_SCALE,
-    NEAR,
-    find_visible_faces,
-    project_inside,
-    render_depth,
-)
+from stillmap.mesh.visibility import NEAR, find_visible_faces, project_inside
 
 _OUTLINE_CELL = 0.01  # m
 _MAX_OUTLINE_CELLS = 1 << 10  # along an edge, beyond which cells are larger
@@ -100,7 +88,10 @@ def assign_object_views(
         all_pixels = find_visible_faces(mesh, moved)
         faces = np.flatnonzero(all_pixels)
         inset = _OUTLINE_INSET + OUTLINE_DRIFT * (0.0 if shape.rigid else _travel(shape, now))
-        depth = _depth_inside_outline(mesh, faces, moved) - inset
+        corners = moved.to_camera(mesh.vertices)
+        depth = np.zeros(len(corners))
+        depth[corners[:, 2] > NEAR] = outline_depth(corners[corners[:, 2] > NEAR], _MAX_FACE_EDGE)
+        depth = depth[mesh.faces[faces]].min(axis=1, initial=np.inf) - inset
         points = mesh.centers[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
         kept = _shows_object(points, depth, number, background)
         faces, points = faces[kept], points[kept]
@@ -148,29 +139,19 @@ def _travel(shape: ObjectShape, seconds: float) -> float:
     return float(np.linalg.norm(at[1] - at[0]))
 
 
-def _depth_inside_outline(mesh: Mesh, faces: Index, view: View) -> Float:
-    """(n,) metres by which faces (n,) lie inside the outline of a mesh in a view."""
-    if not len(faces):
-        return np.zeros(0)
-    points = view.to_camera(mesh.vertices)
-    buffer = render_depth(mesh, view, points[np.unique(mesh.faces[faces])], DEPTH_SCALE)
-    far = ndimage.distance_transform_edt(np.pad(buffer.face >= 0, 1))[1:-1, 1:-1]
-    at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
-    metres = sample_buffer(far, buffer, at) * at[..., 2] / buffer.K[0, 0]
-    return np.asarray(metres.min(axis=1))
-
-
 def outline_depth(points: Float, radius: float) -> Float:
-    """(n,) metres from points (n, 2) to the outline of the area that they cover; 0: on it.
+    """(n,) metres from points (n, 3) to the outline of the area that they cover; 0: on it.
 
-    The area is the union of discs around the points, holes filled, eroded by the same radius.
+    The area is the union of discs around the points in the image, holes filled, eroded by the same
+    radius.
 
     Args:
-        points: metres, in a plane.
-        radius: metres of the discs.
+        points: metres in the camera's frame, in front of it.
+        radius: metres of the discs, at the median depth.
     """
     if not len(points):
         return np.zeros(0)
+    points = points[:, :2] * (np.median(points[:, 2]) / points[:, 2:])
     cell = max(_OUTLINE_CELL, float(np.ptp(points, axis=0).max()) / _MAX_OUTLINE_CELLS)
     at = np.floor(points / cell).astype(np.int64)
     border = int(np.ceil(radius / cell)) + 2
@@ -285,62 +266,38 @@ def color_moving(
     first, last = np.searchsorted(tracked.seconds, [now - IMAGE_WINDOW, now + IMAGE_WINDOW])
     seen = tracked.take(slice(first, last))
     away = np.abs(seen.seconds - now).astype(np.float32)
-    ends, drift = _move_along_tracks(seen, now)
+    for box in inputs.boxes:
+        mine = np.flatnonzero(seen.owner == box.box.object_id)
+        if not len(mine):
+            continue
+        ends, uv, shown = _find_shown(seen.take(mine), box, view, now)
+        shown &= away[mine] < delay[seen.beam[mine]]
+        shown[shown] = background.is_unoccluded(number, ends[shown])
+        mine, ends, uv = mine[shown], ends[shown], uv[shown]
+        free = np.ones(len(ends))
+        for other in boxes_at([one for one in inputs.boxes if one is not box], now):
+            # points in the box of another object, or near it, may be its own
+            within = (np.abs(other.local(ends)) <= other.half_size + OUTLINE_MARGIN).all(axis=1)
+            hidden = occlusion_probability([other], view.position, ends[~within])
+            free[~within] *= 1.0 - hidden
+        mine, uv = mine[free >= MIN_P_VISIBLE], uv[free >= MIN_P_VISIBLE]
+        if len(mine):
+            colors = np.rint(sample_bilinear(background.image(number), uv)).astype(np.uint8)
+            out[seen.beam[mine]] = avoid_gray(colors)
+            delay[seen.beam[mine]] = away[mine]
+
+
+def _find_shown(
+    seen: DynamicReturns, box: TrackedBox, view: View, now: float
+) -> tuple[Float, Float, Bool]:
+    """End points (n, 3) on an object, moved with it to a time, and their pixels (n, 2) in a view;
+    whether (n,) they are in it and within the outline that all of them have there."""
+    motion = box.motion_until(now, seen.seconds)
+    ends = seen.ends.copy()
+    ends[:, :2] += motion
     local = view.to_camera(ends)
-    uv, ok = project_inside(view, local)
-    ok &= local[:, 2] > NEAR
-    ok &= _point_depths(seen.owner, local, ok) >= _POINT_INSET + OUTLINE_DRIFT * drift
-    ok &= away < delay[seen.beam]
-    shown = np.flatnonzero(ok)
-    shown = shown[background.is_unoccluded(number, ends[shown])]
-    shown = shown[_is_unoccluded_by_others(ends[shown], seen.owner[shown], inputs.boxes, view, now)]
-    if not len(shown):
-        return
-    colors = np.rint(sample_bilinear(background.image(number), uv[shown]))
-    out[seen.beam[shown]] = avoid_gray(colors.astype(np.uint8))
-    delay[seen.beam[shown]] = away[shown]
-
-
-def _move_along_tracks(seen: DynamicReturns, now: float) -> tuple[Float, Float]:
-    """(n, 3) end points, each moved with its object to a time, and (n,) metres of that motion."""
-    out, moved = seen.ends.copy(), np.zeros(len(seen.ends))
-    boxes = {tracked.box.object_id: tracked for tracked in seen.inputs.boxes}
-    for owner in np.unique(seen.owner).tolist():
-        mine = seen.owner == owner
-        motion = boxes[owner].motion_until(now, seen.seconds[mine])
-        out[mine, :2] += motion
-        moved[mine] = np.linalg.norm(motion, axis=1)
-    return out, moved
-
-
-def _point_depths(owner: Int32, local: Float, shown: Bool) -> Float:
-    """(n,) metres by which points lie inside the outline of their object in an image.
-
-    Args:
-        owner: (n,) object.
-        local: (n, 3) metres in the camera's frame, moved to the time of the image.
-        shown: (n,) whether they are in the image.
-    """
-    out = np.full(len(shown), -np.inf)
-    for number in np.unique(owner[shown]).tolist():
-        mine = np.flatnonzero(shown & (owner == number))
-        x, y, z = local[mine].T
-        plane = np.stack([x / z, y / z], axis=1) * np.median(z)
-        out[mine] = outline_depth(plane, _POINT_RADIUS)
-    return out
-
-
-def _is_unoccluded_by_others(
-    points: Float, owner: Int32, boxes: Sequence[TrackedBox], view: View, now: float
-) -> Bool:
-    """(n,) whether probably no other object stands between a camera and points (n, 3).
-
-    Points in an object's box, or near it, count as its own.
-    """
-    free = np.ones(len(points))
-    for tracked in boxes:
-        for box in boxes_at([tracked], now):
-            within = (np.abs(box.local(points)) <= box.half_size + OUTLINE_MARGIN).all(axis=1)
-            rest = np.flatnonzero((owner != tracked.box.object_id) & ~within)
-            free[rest] *= 1.0 - occlusion_probability([box], view.position, points[rest])
-    return free >= MIN_P_VISIBLE
+    uv, shown = project_inside(view, local)
+    shown &= local[:, 2] > NEAR
+    inset = _POINT_INSET + OUTLINE_DRIFT * np.linalg.norm(motion, axis=1)
+    shown[shown] = outline_depth(local[shown], _POINT_RADIUS) >= inset[shown]
+    return ends, uv, shown

@@ -111,17 +111,11 @@ def median_angle(one: Float, other: Float) -> float:
     return float(2.0 * np.arcsin(0.5 * np.median(known))) if len(known) else float("nan")
 
 
-def find_scan_layout(recording: Recording, chosen: Index) -> ScanLayout:
-    """The range images of a 3D recording.
-
-    Args:
-        recording: 3D.
-        chosen: scans to be used; where scans are rows, all are.
-    """
-    counts = np.diff(recording.offset)
+def find_scan_layout(recording: Recording) -> ScanLayout:
+    """The range images of all scans of a 3D recording."""
     if is_row_scanner(recording):
         return ScanLayout(True, _split_sequences(recording))
-    return ScanLayout(False, [np.array([t]) for t in chosen if counts[t]])
+    return ScanLayout(False, list(np.flatnonzero(np.diff(recording.offset))[:, None]))
 
 
 def _split_sequences(recording: Recording) -> list[Index]:

@@ -48,17 +48,6 @@ _BLOCK_EDGE, _BLOCK_BYTES = 8, 4200  # voxels along a block, and its size
 _MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
 _MIN_TURN = 0.1  # rad, likewise
 _SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a mover
-_SAMPLED_SCANS = 64  # of which the ranges are taken
-
-
-def median_range(recording: Recording) -> float:
-    """Median range in metres of the hits of some scans; 0 where there are none."""
-    n = recording.n_scans
-    sampled = np.unique(np.linspace(0, n - 1, min(n, _SAMPLED_SCANS)).astype(np.intp))
-    parts = [recording.points[b][recording.hit[b]] for b in map(recording.beams_of, sampled)]
-    ranges = np.concatenate([np.zeros(0), *(np.linalg.norm(part, axis=1) for part in parts)])
-    ranges = ranges[np.isfinite(ranges)]
-    return float(np.median(ranges)) if len(ranges) else 0.0
 
 
 def select_scans(T_map_sensor: Float, sensor: Int32, scene_range: float) -> Index:
@@ -83,8 +72,8 @@ def select_scans(T_map_sensor: Float, sensor: Int32, scene_range: float) -> Inde
 
 def choose_resolution(
     recording: Recording, poses: Float, layout: ScanLayout, voxel_size: float | None = None
-) -> tuple[float, float]:
-    """The edge of a voxel in metres, and the angle in rad between beams of range images.
+) -> tuple[float, float, float]:
+    """The edge of a voxel and the median range in metres, and the angle in rad between beams.
 
     A voxel is as wide as the beam spacing on surfaces, and wider than range noise; larger where
     memory would exceed its limit. Where beams lie much denser than voxels, some are left out.
@@ -102,15 +91,15 @@ def choose_resolution(
     patches = [make() for make in triangulate_scans(recording, poses, some)]
     patches = [one for one in patches if len(one.faces)]
     if not patches:
-        return voxel_size or _MAX_VOXEL, 0.0
+        return voxel_size or _MAX_VOXEL, 0.0, 0.0
     spacing = float(np.median([beam_spacing(one) for one in patches]))
     ranges = [np.linalg.norm(one.points - one.origin, axis=1) for one in patches]
     noises = [range_std(away, one.faces) for away, one in zip(ranges, patches, strict=True)]
     noise = float(np.median(noises))
     wanted = float(np.clip(max(spacing, _NOISE_RATIO * noise), _MIN_VOXEL, _MAX_VOXEL))
     voxel = voxel_size or max(wanted, min_voxel_size(recording, poses))
-    wide = _MAX_SPACING * voxel
-    return voxel, wide / float(np.median(np.concatenate(ranges))) if wide >= 2.0 * spacing else 0.0
+    wide, scene_range = _MAX_SPACING * voxel, float(np.median(np.concatenate(ranges)))
+    return voxel, scene_range, wide / scene_range if wide >= 2.0 * spacing else 0.0
 
 
 def beam_spacing(patch: Patch) -> float:
@@ -160,11 +149,13 @@ def build_surface(
         tell: called with the work done and the total.
     """
     options = options or MeshOptions()
-    T = recording.T_map_sensor(poses)
-    chosen = select_scans(T, recording.sensor, median_range(recording))
-    layout = find_scan_layout(recording, chosen)
-    voxel, min_angle = choose_resolution(recording, poses, layout, options.voxel_size)
-    layout = layout._replace(min_angle=min_angle)
+    layout = find_scan_layout(recording)
+    voxel, scene_range, min_angle = choose_resolution(recording, poses, layout, options.voxel_size)
+    if not layout.is_planar:
+        scans = np.concatenate([np.zeros(0, np.intp), *layout.groups])
+        T_map_sensor = recording.T_map_sensor(poses)[scans]
+        chosen = select_scans(T_map_sensor, recording.sensor[scans], scene_range)
+        layout = ScanLayout(False, [scans[[k]] for k in chosen], min_angle)
     n = len(layout.groups)
 
     def weighted(make: Callable[[], Patch]) -> tuple[Patch, Float32]:

@@ -16,7 +16,7 @@ def loose(monkeypatch):
 
 
 def patches(recording, poses):
-    order = find_scan_layout(recording, np.arange(recording.n_scans))
+    order = find_scan_layout(recording)
     return order, [make() for make in triangulate_scans(recording, poses, order)]
 
 
