@@ -40,62 +40,41 @@ def _corner(rng: np.random.Generator, n: int = 15) -> Mesh:
     return Mesh(mesh.vertices, np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
-def _seen(rng: np.random.Generator, wrong: np.ndarray) -> list[PartialSurface]:
-    """Looks at it by a track that is wrong by a motion."""
-    out = []
+def _looks(seed: int, wrong: np.ndarray, sensor: tuple[float, ...], side=False, turn=0.0, n=15):
+    """Looks at it, or at its side alone, by a track that is wrong by a motion, or turned."""
+    rng, out = np.random.default_rng(seed), []
+    askew, _ = motion_transform(np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0]), 1.0)
     for later in LATER:
-        mesh, (R, t) = _corner(rng), motion_transform(wrong, later)
-        out.append(
-            PartialSurface.from_mesh(
-                Mesh((mesh.vertices - t) @ R, mesh.faces), np.array([-8.0, 6.0, 1.0]), later
-            )
-        )
+        mesh, (R, t) = _corner(rng, n), motion_transform(wrong, later)
+        mesh = mesh.select(mesh.centers[:, 1] > 0.8) if side else mesh
+        seen = Mesh((mesh.vertices @ askew.T - t) @ R, mesh.faces)
+        out.append(PartialSurface.from_mesh(seen, np.array(sensor), later))
     return out
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_wrong_velocity_is_found(seed: int) -> None:
-    rng = np.random.default_rng(seed)
     wrong = np.array([0.8, -0.3, 0.02, 0.06, 0.5, -0.4])
-    sweeps = _seen(rng, wrong)
+    sweeps = _looks(seed, wrong, (-8.0, 6.0, 1.0))
     motion = register_surfaces(sweeps, 2)
     np.testing.assert_allclose(motion[:2], wrong[:2], atol=0.06)
     assert motion[3] == pytest.approx(wrong[3], abs=0.02)
     moved = [one.transform(motion) for one in sweeps]
-    before = [surface_distance(one, sweeps[2]) for one in sweeps]
-    after = [surface_distance(one, moved[2]) for one in moved]
-    assert max(before) > 0.1
-    assert max(after) < 0.03
-    assert after[2] == 0.0
+    assert max(surface_distance(one, sweeps[2]) for one in sweeps) > 0.1
+    assert max(surface_distance(one, moved[2]) for one in moved) < 0.03
 
 
 @pytest.mark.parametrize("turn", [0.1, -0.1])
 @pytest.mark.parametrize("wrong", [(-0.5, -0.6), (0.0, 0.6), (0.3, -1.0)])
-def test_a_side_that_is_askew_is_not_moved_along_itself(
-    wrong: tuple[float, float], turn: float
-) -> None:
-    rng = np.random.default_rng(0)
-    askew, _ = motion_transform(np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0]), 1.0)
+def test_a_side_that_is_askew_is_not_moved_along_itself(wrong, turn) -> None:
     motion = np.array([*wrong, 0.0, 0.0, 0.0, 0.0])
-    sweeps = []
-    for later in LATER:
-        mesh, (R, t) = _corner(rng, 25), motion_transform(motion, later)
-        side = mesh.select(mesh.centers[:, 1] > 0.8)
-        seen = Mesh((side.vertices @ askew.T - t) @ R, side.faces)
-        sweeps.append(PartialSurface.from_mesh(seen, np.array([0.5, 4.0, 1.0]), later))
+    sweeps = _looks(0, motion, (0.5, 4.0, 1.0), side=True, turn=turn, n=25)
     np.testing.assert_allclose(register_surfaces(sweeps, 2)[:2], wrong, atol=0.03)
 
 
 def test_where_nothing_tells_the_track_counts() -> None:
-    sweeps = []
-    for k, later in enumerate(LATER):
-        mesh = _corner(np.random.default_rng(k))
-        side = mesh.select(mesh.centers[:, 1] > 0.8)
-        moved = side.vertices + np.array([0.0, 0.2 * later, 0.0])
-        sweeps.append(
-            PartialSurface.from_mesh(Mesh(moved, side.faces), np.array([0.0, 6.0, 1.0]), later)
-        )
-    motion = register_surfaces(sweeps, 2)
+    wrong = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0])
+    motion = register_surfaces(_looks(0, wrong, (0.0, 6.0, 1.0), side=True), 2)
     assert abs(motion[0]) < 0.05
     assert motion[1] == pytest.approx(-0.2, abs=0.03)
 

@@ -7,12 +7,7 @@ from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
 
 K = np.array([[500.0, 0.0, 320.5], [0.0, 480.0, 239.25], [0.0, 0.0, 1.0]])
-POINTS = np.array(
-    [
-        [0.2739233746429086, -0.4604265724722594, 1.7505322741355447],
-        [-0.9180529521276106, -0.9669447289429418, 2.1456551562825474],
-    ]
-)
+POINTS = np.array([[0.27392337, -0.46042657, 1.75053227], [-0.91805295, -0.96694473, 2.14565516]])
 # cv2.projectPoints and cv2.fisheye.projectPoints of the two points above
 BY_OPENCV = [
     (
@@ -38,8 +33,6 @@ BY_OPENCV = [
 ]
 FOLDING = [  # models whose polynomials fall again
     ("plumb_bob", [-0.3, 0.0, 0.0, 0.0]),
-    ("plumb_bob", [-0.4, 0.05, 0.02, -0.03, 0.0]),
-    ("plumb_bob", [0.0, 0.0, 0.05, 0.02]),
     ("rational_polynomial", [-0.3, 0.0, 0.001, 0.0, 0.0, -0.2, 0.0, 0.0]),
     ("equidistant", [-0.3, 0.0, 0.0, 0.0]),
 ]
