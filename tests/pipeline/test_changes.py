@@ -138,7 +138,8 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
         on_leaf |= np.isin(cell_keys(courses.cells), cell_keys(leaf))
     there |= (element >= 0) & on_leaf[element]
     shown[on_leaf[element]] = 0.0
-    shown *= 1.0 - find_shown_cells(courses, result.mapping.changes, "last").p_leaf[element]
+    _, _, p_leaf = find_shown_cells(courses, result.mapping.changes, "last")
+    shown *= 1.0 - p_leaf[element]
     noise_std = courses.surfel_map.noise_std
     others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static, noise_std)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))

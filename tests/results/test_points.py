@@ -6,7 +6,7 @@ import pytest
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import matrix
-from stillmap.mapping.beam_statistics import count_beams, sample_dynamic_points
+from stillmap.mapping.beam_statistics import count_beams, sample_points
 
 
 @pytest.fixture(params=[7, 1000, 1 << 20])
@@ -49,7 +49,7 @@ def ragged():
 def test_dynamic_points(ragged):
     recording, poses, p_static = ragged
     expected = expected_points(recording, poses, p_static)
-    found = sample_dynamic_points(recording, poses, p_static)
+    found = sample_points(recording, poses, p_static)
     assert 50 < len(found) < recording.n_beams
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -57,8 +57,8 @@ def test_dynamic_points(ragged):
 @pytest.mark.usefixtures("block")
 def test_thinning_keeps_an_even_part_of_the_whole(ragged):
     recording, poses, p_static = ragged
-    full = sample_dynamic_points(recording, poses, p_static)
-    thin = sample_dynamic_points(recording, poses, p_static, limit=10)
+    full = sample_points(recording, poses, p_static)
+    thin = sample_points(recording, poses, p_static, limit=10)
     assert len(thin) == 10
     at = [int(np.flatnonzero((full == point).all(axis=1))[0]) for point in thin]
     assert at == [i * len(full) // 10 for i in range(10)]
@@ -66,8 +66,8 @@ def test_thinning_keeps_an_even_part_of_the_whole(ragged):
 
 def test_none_dynamic(ragged):
     recording, poses, p_static = ragged
-    assert sample_dynamic_points(recording, poses, np.ones_like(p_static)).shape == (0, 2)
-    assert sample_dynamic_points(recording, poses, p_static, limit=0).shape == (0, 2)
+    assert sample_points(recording, poses, np.ones_like(p_static)).shape == (0, 2)
+    assert sample_points(recording, poses, p_static, limit=0).shape == (0, 2)
 
 
 @pytest.mark.usefixtures("block")

@@ -62,24 +62,24 @@ def hit_ratio_e_step(
     """
     # (8) with prior 1 - threshold is exactly r (1 - threshold) / (r (1 - threshold) + ...)
     prior = 1.0 - MIN_HIT_RATIO
-    found = paper_e_step(recording, poses, grid, prior, threads)
-    p = found.p_static
+    by_ratio = paper_e_step(recording, poses, grid, prior, threads)
+    p = by_ratio.p_static
     for _, beams, _ in iter_chunks(recording, release=[p]):
         points, hit = recording.points[beams], recording.hit[beams]
         p[beams] = fill_beams(points, hit, p[beams], prior)
-    return EStepResult(p, found.likelihood, threshold_hit_ratio(grid))
+    return EStepResult(p, by_ratio.likelihood, threshold_hit_ratio(grid))
 
 
 def threshold_hit_ratio(grid: _core.OccupancyGrid2D) -> CellProbabilities:
     """Occupancy 1 where alpha / (alpha + beta) reaches the threshold MIN_HIT_RATIO, else 0."""
-    found, stands = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
+    hit_cells, occupied = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
     for first in grid.block_cells:
         _, alpha, beta = grid.dense(first.tolist(), (BLOCK_CELLS, BLOCK_CELLS))
         rows = np.argwhere(alpha > 0.0)
         alpha, beta = alpha[tuple(rows.T)], beta[tuple(rows.T)]
-        found.append(rows[:, ::-1] + first)
-        stands.append((alpha / (alpha + beta) >= MIN_HIT_RATIO).astype(np.float32))
-    cells, p_occupied = np.concatenate(found), np.concatenate(stands)
+        hit_cells.append(rows[:, ::-1] + first)
+        occupied.append((alpha / (alpha + beta) >= MIN_HIT_RATIO).astype(np.float32))
+    cells, p_occupied = np.concatenate(hit_cells), np.concatenate(occupied)
     order = np.lexsort(cells.T)  # row by row
     return CellProbabilities(cells[order], p_occupied[order], 0.0)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_types import Bool, Float, Float32, Int64
+from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import connected_components, neighbor_pairs
@@ -124,7 +124,9 @@ def change_parameters(recording: Recording, with_paths: bool = True) -> dict[str
     }
 
 
-class _MixtureClasses:
+def _arrange_classes(
+    view: Bool, half_time: Bool, n_static: int, with_surroundings: bool
+) -> tuple[int, Index, tuple[Bool, Bool, Bool, Bool]]:
     """The N classes of `ChangeMixture`: static ones first, the change HMM last.
 
     With surroundings there are two of each of the C classes of HMMs and the change HMM, in
@@ -136,27 +138,20 @@ class _MixtureClasses:
         n_static: number of static ones, which come first.
         with_surroundings: see above.
 
-    Attributes:
-        n_static: number of static ones among the N.
-        columns: (N,) index among the 2 C + 2 columns of classes in lasting and in emptied
-            surroundings.
-        static, view, half_time, changing: (N,) masks, none of which overlap.
+    Returns:
+        number of static ones among the N; (N,) index among the 2 C + 2 columns of classes in
+        lasting and in emptied surroundings; (N,) masks of static, view-dependent, half-time and
+        changing classes, none of which overlap.
     """
-
-    def __init__(self, view: Bool, half_time: Bool, n_static: int, with_surroundings: bool) -> None:
-        n = len(view) + 1
-        self.n_static, self.columns = n_static, np.arange(n)
-        view, half_time = np.append(view, False), np.append(half_time, False)
-        if with_surroundings:
-            fixed, changing = np.arange(n) < n_static, np.arange(n) == n - 1
-            is_static = np.concatenate([fixed | half_time | changing, fixed])
-            self.columns = np.argsort(~is_static, kind="stable")
-            self.n_static = int(is_static.sum())
-        of, static = self.columns % n, np.arange(len(self.columns)) < self.n_static
-        self.view = view[of]
-        self.static = static & ~self.view
-        self.half_time = half_time[of] & ~static
-        self.changing = np.arange(len(of)) == len(of) - 1
+    n = len(view) + 1
+    columns, view, half_time = np.arange(n), np.append(view, False), np.append(half_time, False)
+    if with_surroundings:
+        fixed, changing = columns < n_static, columns == n - 1
+        is_static = np.concatenate([fixed | half_time | changing, fixed])
+        columns, n_static = np.argsort(~is_static, kind="stable"), int(is_static.sum())
+    of, number = columns % n, np.arange(len(columns))
+    static, view = number < n_static, view[of]
+    return n_static, columns, (static & ~view, view, half_time[of] & ~static, number == len(of) - 1)
 
 
 class ChangeMixture:
@@ -176,16 +171,14 @@ class ChangeMixture:
         kept = (observations.tau <= _MAX_DYNAMIC_TAU) | (rho == HALF_TIME_RHO)
         kept[:n_static] = True
         self._observations, self._kept = observations, kept
-        classes = _MixtureClasses(
+        n_static, self._columns, self._groups = _arrange_classes(
             np.isfinite(observations.view_angle[kept]),
             rho[kept] == HALF_TIME_RHO,
             n_static,
             observations.has_surroundings,
         )
-        self._columns, self._static = classes.columns, classes.static
-        self._groups = classes.static, classes.view, classes.half_time, classes.changing
         sample = self._likelihood(observations.sample_rows())
-        self._weights = fit_weights(sample, classes.n_static, options.prior)
+        self._weights = fit_weights(sample, n_static, options.prior)
         self.changing_weight = float(self._weights[-1])
 
     def _likelihood(self, rows: Rows) -> Float32:
@@ -213,10 +206,10 @@ class ChangeMixture:
 
         def process(rows: Rows) -> None:
             likelihood = self._likelihood(rows)
-            p_static[slice(*rows)] = posterior(likelihood, self._weights, self._static)
+            p_static[slice(*rows)] = posterior(likelihood, self._weights, self._groups[0])
             log_changed, log_static = (
                 np.log(np.maximum(_mean_likelihood(likelihood, self._weights, of), _MIN_LIKELIHOOD))
-                for of in (self._groups[-1], self._static)
+                for of in (self._groups[-1], self._groups[0])
             )
             change[slice(*rows)] = np.clip(log_changed - log_static, -_MAX_CHANGE, _MAX_CHANGE)
 

@@ -273,11 +273,11 @@ def _estimate_trust(
     """
     counts, seeing = np.zeros(2), np.zeros(2)  # beams, and those that cross solid cells
     for *_, data in iter_beams(recording, poses):
-        some = np.array(hmm.count_no_return_beams(*data, threads))
-        counts += some
-        if (others := _without_blank_scans(data)) is not data:
-            some = np.array(hmm.count_no_return_beams(*others, threads))
-        seeing += some
+        in_chunk = np.array(hmm.count_no_return_beams(*data, threads))
+        counts += in_chunk
+        if (with_returns := _without_blank_scans(data)) is not data:
+            in_chunk = np.array(hmm.count_no_return_beams(*with_returns, threads))
+        seeing += in_chunk
     blank = counts - seeing
     blind = bool(blank[0] > 0 and _trust(blank) < MIN_TRUST)
     return _trust(counts), _trust(seeing if blind else counts), blind

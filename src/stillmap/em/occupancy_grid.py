@@ -170,7 +170,8 @@ def find_hits_beyond(grid: _core.OccupancyGrid2D, window: GridWindow) -> Float:
 def _hit_blocks(grid: _core.OccupancyGrid2D) -> Int64:
     """(B, 2) column and row of the blocks in which beams ended; all blocks where none did."""
     blocks = grid.block_cells
-    hit = [bool(grid.dense(one, (BLOCK_CELLS, BLOCK_CELLS))[1].any()) for one in blocks.tolist()]
+    shape = BLOCK_CELLS, BLOCK_CELLS
+    hit = [bool(grid.dense(block, shape)[1].any()) for block in blocks.tolist()]
     return (blocks[hit] if any(hit) else blocks) // BLOCK_CELLS
 
 

@@ -97,13 +97,13 @@ def e_step_3d(
             p_static, change, obstacles, recording, poses, threads
         )
         p_static, obstacles = spatial_coupling.label_far_ground(p_static, obstacles)
-    found = label_beams(observations, None, fit, recording, poses, p_static, obstacles)
+    labelled = label_beams(observations, None, fit, recording, poses, p_static, obstacles)
     changed_cells = None
     if options.change_detection_3d:
         changed_cells = select_changed_cells(mixture.decode_histories())
     return replace(
-        found,
-        learned={**found.learned, "changing": round(mixture.changing_weight, 6)},
+        labelled,
+        learned={**labelled.learned, "changing": round(mixture.changing_weight, 6)},
         changed_cells=changed_cells,
         ground=ground,
     )

@@ -123,8 +123,8 @@ def find_changed(recording: Recording, T_map_sensor: Float, detections: Detectio
         here = slice(of_scan[t], of_scan[t + 1])
         if here.start == here.stop:
             continue
-        for other in compared[t]:
-            out[here] |= _is_free(recording, other, T_map_sensor[other], detections.xy[here])
+        for scan in compared[t]:
+            out[here] |= _is_free(recording, scan, T_map_sensor[scan], detections.xy[here])
     return out
 
 

@@ -26,33 +26,25 @@ def count_beams(recording: Recording, p_static: Float32) -> dict[str, int]:
     }
 
 
-def sample_dynamic_points(
-    recording: Recording, poses: Float, p_static: Float32, limit: int = 200_000
+def sample_points(
+    recording: Recording,
+    poses: Float,
+    p_static: Float32,
+    limit: int = 200_000,
+    dynamic: bool = True,
 ) -> Float:
-    """Sample the end points, in the map frame, of the hits with p_static < 0.5.
+    """Sample the end points, in the map frame, of the hits that are dynamic, or of the others.
 
     Args:
         recording: T scans with M beams in D dimensions.
-        poses: (T, D+1, D+1) float64, T_map_base.
-        p_static: (M,) float32.
+        poses: (T, D+1, D+1) T_map_base.
+        p_static: (M,); below 0.5 a hit is dynamic.
         limit: maximum number of points; of more, evenly spaced ones are taken.
+        dynamic: whether dynamic or static hits.
 
     Returns:
         (K, D) metres, in the recording's order, K <= limit.
     """
-    return _sample_points(recording, poses, p_static, limit, True)
-
-
-def sample_static_points(
-    recording: Recording, poses: Float, p_static: Float32, limit: int
-) -> Float:
-    """Those of the hits with p_static >= 0.5; arguments as of `sample_dynamic_points`."""
-    return _sample_points(recording, poses, p_static, limit, False)
-
-
-def _sample_points(
-    recording: Recording, poses: Float, p_static: Float32, limit: int, dynamic: bool
-) -> Float:
     arrays = recording.hit, p_static
 
     def is_chosen(block: slice) -> Bool:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,29 +17,19 @@ _RADIUS = 3.0  # cells between cells of a recurring change that decide together
 _MIN_WEIGHT = 1e-3
 
 
-class ShownCells(NamedTuple):
-    """The map in some state, in E cells.
-
-    Attributes:
-        listed: (E,) cells that changes concern.
-        p_in_map: (E,) float32, probability that the map shows something there.
-        p_leaf: (E,) float32, probability that it is the leaf of a door, in any position.
-    """
-
-    listed: Bool
-    p_in_map: Float32
-    p_leaf: Float32
-
-
 def find_shown_cells(
     histories: em.CellHistories, changes: list[Change], state: em.MapState
-) -> ShownCells:
+) -> tuple[Bool, Float32, Float32]:
     """The map in some state, in the cells of places that changed.
 
     Args:
         histories: of E cells.
         changes: from `detect_changes`, and `join_doors`.
         state: state of changed places that the map shows.
+
+    Returns:
+        (E,) cells that changes concern; probability that the map shows something there; that it is
+        the leaf of a door, in any position.
     """
     keys = cell_keys(histories.cells)
     listed = np.isin(keys, cell_keys(np.concatenate([one.cells for one in changes])))
@@ -51,7 +40,7 @@ def find_shown_cells(
         for position, leaf in (("open", door.open_cells), ("shut", door.shut_cells)):
             of = _rows(keys, leaf)
             p_leaf[of], p[of], listed[of] = 1.0, float(position == shown), True
-    return ShownCells(listed, p, p_leaf)
+    return listed, p, p_leaf
 
 
 def _weigh_leaves(keys: Cells, changes: list[Change]) -> Float32:

@@ -15,7 +15,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.snapshots import Snapshot, Window, choose_window, snapshot
 
@@ -199,7 +199,7 @@ class EmState(ShortRepr):
             return
         resolution, poses = self.options.slam.resolution, estimate.poses
         boxes = em.beam_boxes(deskewed, poses)
-        points = sample_dynamic_points(deskewed, poses, estimate.p_static).astype(np.float32)
+        points = sample_points(deskewed, poses, estimate.p_static).astype(np.float32)
         if self.window is None:
             self.window = choose_window(_extent(boxes, resolution), resolution, points)
         shown = {1, 2, self.require_best().number}  # and the last, whichever that will be

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.quality import Quality
 from stillmap.results.colors import KIND_COLORS
 from stillmap.results.mapped_place import MappedPlace
@@ -45,9 +45,7 @@ def plot_result(
     ax.imshow(np.asarray(image.convert("RGB")), extent=extent, interpolation="nearest")
     placed = [one for one in result.sessions if one.accepted]
     for session in moving:
-        points = sample_dynamic_points(
-            session.deskewed, session.poses, session.p_static, limit=_MAX_POINTS
-        )
+        points = sample_points(session.deskewed, session.poses, session.p_static, limit=_MAX_POINTS)
         x, y = points[:, :2].T
         ax.plot(x, y, ".", color=_ORANGE, markersize=1.5, label="dynamic returns")
     for one in placed if trajectory else []:

@@ -194,7 +194,9 @@ class SweepLoopCloser:
         )
         if explained < _MIN_EXPLAINED_RATIO * odometry.explained[later]:
             return closure.reject("explains too little")
-        if self._plane_overlap(planes, sweep, later, state) < MIN_PLANE_OVERLAP:
+        points = sweep.deskew(state.twist).astype(np.float64)
+        own, T_own = self._build_planes(later), odometry.poses[later]
+        if plane_overlap(points, own, T_own, planes, state.T_map_base) < MIN_PLANE_OVERLAP:
             return closure.reject("surfaces do not overlap")
         grid, usual = self._build_grid(earlier)
         if self._occluded_share(grid, sweep, later, state) > usual + _MAX_OCCLUDED:
@@ -237,14 +239,6 @@ class SweepLoopCloser:
         state = State(odometry.poses[center], odometry.twists[center], np.zeros((12, 12)))
         sweep = downsample_sweep(select_sweep(self.recording, self.e, center))
         return grid, self._occluded_share(grid, sweep, center, state)
-
-    def _plane_overlap(
-        self, planes: _core.NdtMap3D, sweep: Sweep, later: int, state: State
-    ) -> float:
-        """Share of the planes around a later sweep that lie on earlier ones."""
-        points = sweep.deskew(state.twist).astype(np.float64)
-        own, T_own = self._build_planes(later), self.odometry.poses[later]
-        return plane_overlap(points, own, T_own, planes, state.T_map_base)
 
     def _occluded_share(
         self, grid: _core.OccupancyGrid3D, sweep: Sweep, t: int, state: State

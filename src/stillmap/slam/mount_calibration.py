@@ -120,16 +120,13 @@ def calibrate_mounts(
 
 
 def _is_suspicious(found: Calibration) -> bool:
-    if any(found.upside_down):
-        return True
-    named = [*found.odometry.items()] + [item for one in found.lasers for item in one.items()]
-    return any(_excess(name, one) > _SUSPICIOUS for name, one in named)
-
-
-def _excess(name: str, one: Parameter) -> float:
-    """Difference over the least one that is applied; 0 within two standard deviations."""
-    off = abs(difference(name, one.value, one.nominal))
-    return off / _MIN_DIFFERENCE[name] if off > 2.0 * one.std else 0.0
+    """True if differences beyond two standard deviations are nearly as large as those applied."""
+    named = [*found.odometry.items()] + [item for laser in found.lasers for item in laser.items()]
+    for name, fitted in named:
+        off = abs(difference(name, fitted.value, fitted.nominal))
+        if off > 2.0 * fitted.std and off / _MIN_DIFFERENCE[name] > _SUSPICIOUS:
+            return True
+    return any(found.upside_down)
 
 
 class _Calibrator:
@@ -329,14 +326,10 @@ def _windows(recording: Recording, poses: Float, laser: int) -> MotionWindows:
             since = 0.0
     first, last = scans[ends[:-1]], scans[ends[1:]]
     T = poses @ recording.T_base_sensor[laser]
-    none = np.zeros(0, np.intp)
     return MotionWindows(
         first,
         last,
         np.arange(len(first)) // _WINDOWS_PER_SEGMENT,
         se2.parameters(se2.inverse(T[first]) @ T[last]),
         np.tile(np.diag(np.square(_STD)), (len(first), 1, 1)),
-        np.zeros((0, 2), np.intp),
-        np.zeros(0),
-        none,
     )

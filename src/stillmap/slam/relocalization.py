@@ -119,7 +119,8 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
     poses = context.poses.copy()
     for first, last in itertools.pairwise([*candidates, len(poses)]):
         context = dataclasses.replace(context, poses=poses)
-        before = _build_map_before(context, first)
+        earlier = context.keyframes[context.keyframes < first].tolist()
+        before = context.build_map(context.recording.iter_scans(earlier, context.e))
         here = Placement(np.eye(3), *_count_support(context, before, np.eye(3), first, last))
         if here.is_supported:
             continue
@@ -235,12 +236,6 @@ def _deduplicate(context: LoopContext, closures: list[LoopClosure]) -> list[Loop
         if not any(_is_same(context, _correction(context, other), closure) for other in kept):
             kept.append(closure)
     return kept
-
-
-def _build_map_before(context: LoopContext, first: int) -> _core.OccupancyGrid2D:
-    """Map of the keyframes before scan `first`."""
-    before = context.keyframes[context.keyframes < first].tolist()
-    return context.build_map(context.recording.iter_scans(before, context.e))
 
 
 def _count_support(

@@ -6,7 +6,7 @@ are those in which odometry says that the robot turns or travels most.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -57,9 +57,9 @@ class MotionWindows:
     segment: Index
     motion: Float
     covariance: Float
-    steps: Index
-    turns: Float
-    step_segment: Index
+    steps: Index = field(default_factory=lambda: np.zeros((0, 2), np.intp))
+    turns: Float = field(default_factory=lambda: np.zeros(0))
+    step_segment: Index = field(default_factory=lambda: np.zeros(0, np.intp))
 
 
 def select_segments(recording: Recording, sensor: int, windows: int) -> list[Index]:
@@ -139,10 +139,7 @@ def measure_motion(
     found = [_Tracker(recording, e, scans, resolution).run(k) for k, scans in enumerate(segments)]
     if not found:
         none = np.zeros(0, np.intp)
-        empty = np.zeros((0, 2), np.intp)
-        return MotionWindows(
-            none, none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), empty, np.zeros(0), none
-        )
+        return MotionWindows(none, none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)))
     return MotionWindows(
         *(np.concatenate([getattr(one, name) for one in found]) for name in _FIELDS)
     )

@@ -5,8 +5,6 @@ show a plane (in 2D a line) in the same cube, its displacement across the surfac
 of the two stretches contradict each other by. `docs/estimator.md` has the definition.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from stillmap.core.array_types import Float, Int64
@@ -26,16 +24,6 @@ _MAX_DISPLACEMENT = 0.2  # m, that more counts as: it may be another surface
 _MAX_RETURNS = 500_000  # of all scans; of longer recordings, every so many scans are used
 
 
-class _Patches(NamedTuple):
-    """Planar patches, sorted by cube and then by stretch of travel."""
-
-    cube: Int64
-    stretch: Int64
-    returns: Int64
-    mean: Float
-    normal: Float
-
-
 def mean_displacement(recording: Recording, poses: Float) -> float | None:
     """Mean displacement in metres of surfaces seen again on later visits; None of too few pairs.
 
@@ -46,18 +34,18 @@ def mean_displacement(recording: Recording, poses: Float) -> float | None:
         recording: 2D or 3D, deskewed.
         poses: (T, D+1, D+1) T_map_base.
     """
-    patches = _fit_patches(*_collect_returns(recording, poses))
-    first = np.flatnonzero(patches.cube[:-1] == patches.cube[1:])
+    cube, stretch, returns, mean, normal = _fit_patches(*_collect_returns(recording, poses))
+    first = np.flatnonzero(cube[:-1] == cube[1:])
     second = first + 1
-    cosine = np.abs(np.sum(patches.normal[first] * patches.normal[second], axis=1))
+    cosine = np.abs(np.sum(normal[first] * normal[second], axis=1))
     used = cosine > _MIN_COSINE
-    used &= patches.stretch[second] - patches.stretch[first] > _ADJACENT
+    used &= stretch[second] - stretch[first] > _ADJACENT
     first, second = first[used], second[used]
     if len(first) < _MIN_PAIRS:
         return None
-    step = patches.mean[second] - patches.mean[first]
-    across = np.abs(np.sum(step * patches.normal[first], axis=1))
-    weight = np.minimum(patches.returns[first], patches.returns[second])
+    step = mean[second] - mean[first]
+    across = np.abs(np.sum(step * normal[first], axis=1))
+    weight = np.minimum(returns[first], returns[second])
     return float(np.average(np.minimum(across, _MAX_DISPLACEMENT), weights=weight))
 
 
@@ -76,8 +64,12 @@ def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Int64]:
     return np.concatenate(points), np.concatenate(stretches)
 
 
-def _fit_patches(points: Float, stretch: Int64) -> _Patches:
-    """The planar patches among the returns of each cube and stretch."""
+def _fit_patches(points: Float, stretch: Int64) -> tuple[Int64, Int64, Int64, Float, Float]:
+    """The planar patches among the returns of each cube and stretch, sorted by these.
+
+    Returns:
+        cube, stretch, number of returns; mean and normal (P, D) of each.
+    """
     D = points.shape[1]
     cubes = np.floor(points / CELL).astype(np.int64)
     keys = np.column_stack([cubes, stretch])
@@ -88,7 +80,7 @@ def _fit_patches(points: Float, stretch: Int64) -> _Patches:
     start = np.flatnonzero(is_first)
     if not len(start):
         none, flat = np.empty(0, np.int64), np.empty((0, D))
-        return _Patches(none, none, none, flat, flat)
+        return none, none, none, flat, flat
     count = np.diff(np.append(start, len(keys)))
     local = points - (keys[:, :D] + 0.5) * CELL  # small numbers: squares lose no digits
     mean = np.add.reduceat(local, start) / count[:, None]
@@ -99,7 +91,7 @@ def _fit_patches(points: Float, stretch: Int64) -> _Patches:
     is_flat = (count >= _MIN_RETURNS) & (variance[:, 1] > _MIN_EXTENT**2)
     is_flat &= variance[:, 0] < _MAX_FLATNESS * variance[:, 1]
     cube = np.cumsum(np.any(np.diff(keys[start, :D], axis=0, prepend=keys[:1, :D]) != 0, axis=1))
-    return _Patches(
+    return (
         cube[is_flat],
         keys[start, D][is_flat],
         count[is_flat],

@@ -114,16 +114,8 @@ def compute_log_ratio(explained: Float, others: Float) -> Float:
     return np.asarray(betaln(others + 1.0, explained + 1.0) - log_mover)
 
 
-class _Boxes(NamedTuple):
+def _place_boxes(seconds: Float, paths: Sequence[MoverPath]) -> tuple[Index, Index, Float, Float]:
     """Boxes of K paths in all of their scans, rising: which scan (R,), path, center, heading."""
-
-    scan: Index
-    path: Index
-    xy: Float
-    heading: Float
-
-
-def _place_boxes(seconds: Float, paths: Sequence[MoverPath]) -> _Boxes:
     scans = [np.arange(*path.scans(seconds)) for path in paths]
     states = [path.state_at(seconds[some]) for path, some in zip(paths, scans, strict=True)]
     xy, velocity = (np.concatenate(column) for column in zip(*states, strict=True))
@@ -132,7 +124,7 @@ def _place_boxes(seconds: Float, paths: Sequence[MoverPath]) -> _Boxes:
     order = np.argsort(scan, kind="stable")
     heading = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
     heading[~heading.any(axis=1)] = (1.0, 0.0)  # of what stands, any
-    return _Boxes(scan[order], path[order], xy[order], heading[order])
+    return scan[order], path[order], xy[order], heading[order]
 
 
 def find_mover_hits(
@@ -149,28 +141,28 @@ def find_mover_hits(
     """
     if not len(paths):
         return MoverHits(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0))
-    boxes = _place_boxes(seconds, paths)
+    scan, number, center, heading = _place_boxes(seconds, paths)
     is_round = np.array([path.is_round for path in paths])
     half = 0.5 * np.array([(path.length, path.width) for path in paths])
     half += np.where(is_round, _MARGIN_OF_WALKERS, _MARGIN)[:, None]
-    begins = np.flatnonzero(np.diff(boxes.scan, prepend=-1))
-    rows = np.split(np.arange(len(boxes.scan)), begins[1:])
+    begins = np.flatnonzero(np.diff(scan, prepend=-1))
+    rows = np.split(np.arange(len(scan)), begins[1:])
     found = []
     T_map_sensor = recording.T_map_sensor(poses)
     for k in recording.iter_scans(range(len(rows))):
-        row, t = rows[k], int(boxes.scan[rows[k][0]])
+        row, t = rows[k], int(scan[rows[k][0]])
         of_scan = recording.beams_of(t)
         beam = of_scan.start + np.flatnonzero(recording.hit[of_scan])
         xy = recording.points[beam] @ T_map_sensor[t, :2, :2].T + T_map_sensor[t, :2, 2]
-        off, u, size = xy[:, None] - boxes.xy[row], boxes.heading[row], half[boxes.path[row]]
+        off, u, size = xy[:, None] - center[row], heading[row], half[number[row]]
         inside = np.abs((off * u).sum(axis=-1)) <= size[:, 0]
         inside &= np.abs(off[..., 1] * u[:, 0] - off[..., 0] * u[:, 1]) <= size[:, 1]
-        inside &= ~is_round[boxes.path[row]] | ((off**2).sum(axis=-1) <= size[:, 0] ** 2)
-        weights = inside * p_mover[boxes.path[row]]
+        inside &= ~is_round[number[row]] | ((off**2).sum(axis=-1) <= size[:, 0] ** 2)
+        weights = inside * p_mover[number[row]]
         likeliest = weights.argmax(axis=1)
         weight = weights[np.arange(len(beam)), likeliest]
         kept = weight > 0.0
-        found.append((beam[kept], boxes.path[row[likeliest[kept]]], weight[kept]))
+        found.append((beam[kept], number[row[likeliest[kept]]], weight[kept]))
     return MoverHits(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

@@ -5,7 +5,6 @@ the tracks get all beams of the object, and its height, back afterwards.
 """
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 
@@ -55,34 +54,17 @@ def track_objects_3d(
     if not options.enabled:
         return []
     planar_poses = se2.project_to_plane(recording.T_map_sensor(poses))
-    found = _segment_scans(recording, poses, planar_poses, p_static, ground, MIN_P_DYNAMIC, threads)
-    hit = np.ones(len(found.nearest), np.bool_)
-    planar = make_planar_recording(recording, found.points, hit, found.offset)
-    objects = track_objects(planar, planar_poses, p_static[found.nearest], options)
-    owned = _collect_beams(objects, found.nearest, found.segment, found.beam)
+    points, nearest, offset, segment, beam = _segment_scans(
+        recording, poses, planar_poses, p_static, ground, MIN_P_DYNAMIC, threads
+    )
+    planar = make_planar_recording(recording, points, np.ones(len(nearest), np.bool_), offset)
+    objects = track_objects(planar, planar_poses, p_static[nearest], options)
+    owned = _collect_beams(objects, nearest, segment, beam)
     found_3d = [
         _add_height(one, beams, recording, poses, p_static)
         for one, beams in zip(objects, owned, strict=True)
     ]
     return select_movers(drop_surface_parts(found_3d, recording, p_static), recording, poses)
-
-
-class _Segments(NamedTuple):
-    """Segments of dynamic end points above the ground.
-
-    Attributes:
-        points: (N, 2) metres, the nearest in each direction, in the planar frame of each sensor.
-        nearest: (N,) their beams.
-        offset: (T + 1,) scan t has offset[t]:offset[t + 1] of them.
-        segment: (K,) segment of each dynamic beam, rising from scan to scan.
-        beam: (K,) their numbers, rising.
-    """
-
-    points: Float32
-    nearest: Index
-    offset: Int64
-    segment: Index
-    beam: Index
 
 
 def _segment_scans(
@@ -93,7 +75,14 @@ def _segment_scans(
     ground: GroundMap,
     min_p_dynamic: float,
     threads: int,
-) -> _Segments:
+) -> tuple[Float32, Index, Int64, Index, Index]:
+    """Segments of dynamic end points above the ground.
+
+    Returns:
+        (N, 2) metres, the nearest in each direction, in the planar frame of each sensor; (N,) their
+        beams; (T + 1,) scan t has offset[t]:offset[t + 1] of them; (K,) segment of each dynamic
+        beam, rising from scan to scan; (K,) the numbers of these, rising.
+    """
     T_map_sensor, n = recording.T_map_sensor(poses), recording.n_scans
     scratch, offset, segments = recording.scratch, np.zeros(n + 1, np.int64), 0
     points, nearest = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.intp, (), scratch)
@@ -120,7 +109,7 @@ def _segment_scans(
         beam.append(number)
         segments += int(segment.max()) + 1 if len(segment) else 0
         offset[t + 1] = offset[t] + len(near)
-    return _Segments(points.finish(), nearest.finish(), offset, segment_of.finish(), beam.finish())
+    return points.finish(), nearest.finish(), offset, segment_of.finish(), beam.finish()
 
 
 def _connect_columns(xy: Float) -> Index:

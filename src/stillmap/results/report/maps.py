@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core.grid_map import GridMap
-from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Window, extent
@@ -125,7 +125,7 @@ def map_data(result: MappingResult, view: MapView, filtered: Image.Image) -> dic
 
 def draw_dynamic(result: "MappingResult | TiltingResult", view: MapView) -> str:
     """`data:` URI of the dynamic returns as a layer over the map."""
-    ends = sample_dynamic_points(result.deskewed, result.poses, result.p_static)[:, :2]
+    ends = sample_points(result.deskewed, result.poses, result.p_static)[:, :2]
     return data_uri(draw_points(ends, view))
 
 

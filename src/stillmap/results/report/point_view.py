@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.mapping.beam_statistics import sample_dynamic_points, sample_static_points
+from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.colors import ORANGE, color_by_height
 from stillmap.results.report.figures import data_uri
@@ -48,8 +48,8 @@ def points_data(
         return None
     deskewed, poses = seen.deskewed, result.frame.to_local(seen.poses)
     samples = (
-        sample_static_points(deskewed, poses, seen.p_static, _MAX_STATIC),
-        sample_dynamic_points(deskewed, poses, seen.p_static, _MAX_DYNAMIC),
+        sample_points(deskewed, poses, seen.p_static, _MAX_STATIC, dynamic=False),
+        sample_points(deskewed, poses, seen.p_static, _MAX_DYNAMIC),
     )
     static, dynamic = (np.asarray(points, np.float32) for points in samples)
     ceiling = find_ceiling(static[:, 2], float(poses[:, 2, 3].mean()))

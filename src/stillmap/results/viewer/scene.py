@@ -16,7 +16,7 @@ from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
-from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
 from stillmap.results.objects import interpolate_pose
@@ -310,7 +310,7 @@ class Beams:
             end = min(first + _BLOCK_SCANS, T)
             poses, p_static = self.poses[first:end], self.p_static[offset[first] : offset[end]]
             block = deskew_recording(self.recording.slice_scans(first, end), poses, self.slam)
-            parts.append(sample_dynamic_points(block, poses, p_static, len(p_static)))
+            parts.append(sample_points(block, poses, p_static, len(p_static)))
             self.recording.release_pages(self.p_static)
         ends = np.concatenate(parts)
         return ends[sample_indices(len(ends), max_count)]
