@@ -65,6 +65,18 @@ def cone(side: int = 25, width: float = 90.0) -> Any:
     return u / np.linalg.norm(u, axis=1, keepdims=True)
 
 
+ROOM = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
+
+
+def at(m: em.OccupancyMap, points: Any, layer: Any = None) -> Any:
+    """p_occupied, or a layer like it, where these points lie; NaN outside."""
+    first = np.round(np.array(m.origin[:2]) / m.resolution).astype(int)
+    values = np.asarray(m.p_occupied if layer is None else layer, float)
+    padded = np.pad(values, 1, constant_values=np.nan)
+    column, row = (np.floor(np.asarray(points) / m.resolution).astype(int) - first + 1).T
+    return padded[np.clip(row, 0, len(padded) - 1), np.clip(column, 0, padded.shape[1] - 1)]
+
+
 @dataclass(frozen=True)
 class Watched:
     """A recording from one position, and what reflected each beam."""
@@ -77,19 +89,17 @@ class Watched:
         D = self.recording.dimension
         return np.tile(np.eye(D + 1), (self.recording.n_scans, 1, 1))
 
-    def grid(self, e: Any = None, resolution: float = RESOLUTION) -> Any:
+    def grid(self, e: Any = None) -> Any:
         """The sums of (10); every hit counts as static without e."""
         D = self.recording.dimension
-        grid = (_core.OccupancyGrid2D, _core.OccupancyGrid3D)[D - 2](resolution)
+        grid = (_core.OccupancyGrid2D, _core.OccupancyGrid3D)[D - 2](RESOLUTION)
         if D == 2:
             em.add_recording(grid, self.recording, self.poses, e)
         return grid
 
-    def e_step(
-        self, resolution: float = RESOLUTION, estimator: em.Estimator = "stillmap", **options: Any
-    ) -> em.EStepResult:
-        grid = self.grid(None, resolution)
-        return em.e_step(self.recording, self.poses, grid, estimator, em.EmOptions(**options))
+    def e_step(self, estimator: em.Estimator = "stillmap", **options: Any) -> em.EStepResult:
+        chosen = em.EmOptions(**options)
+        return em.e_step(self.recording, self.poses, self.grid(), estimator, chosen)
 
     def of(self, values: Any, *what: int) -> Any:
         """The values of the beams that these walls or balls reflected."""
@@ -101,35 +111,30 @@ def watch(
     seconds: float = 60.0,
     directions: Any = None,  # (n, D), or what gives them at a time
     *,
-    every: float = 1.0,
     noise: float = 0.01,
-    most: float = FAR,
-    seed: int = 0,
 ) -> Watched:
-    """Watches walls and balls from the origin."""
-    rng = np.random.default_rng(seed)
+    """Watches walls and balls from the origin, once a second."""
+    rng = np.random.default_rng(0)
     looking = directions if callable(directions) else lambda _: directions
     directions = fan() if directions is None else directions
-    times = np.arange(0.0, seconds, every)
+    times = np.arange(0.0, seconds)
     points, what = [], []
-    offset = [0]
     for t in times:
         u = looking(t)
-        offset.append(offset[-1] + len(u))
         ranges = np.full((len(things) + 1, len(u)), np.inf)  # the last: nothing
         for i, thing in enumerate(things):
             if isinstance(thing, Wall) or thing.since <= t < thing.until:
                 ranges[i] = thing.ranges(np.zeros(u.shape[1]), u)
         nearest = ranges.argmin(axis=0)
         r = ranges.min(axis=0)
-        seen = r < most
+        seen = r < FAR
         what.append(np.where(seen, nearest, -1))
-        r = np.where(seen, r + rng.normal(scale=noise, size=len(u)), most)
+        r = np.where(seen, r + rng.normal(scale=noise, size=len(u)), FAR)
         points.append(u * r[:, None])
     what_hit = np.concatenate(what)
     recording = of_one_sensor(
         np.round(times * 1e9).astype(np.int64),
-        np.array(offset),
+        np.cumsum([0, *map(len, points)]),
         np.concatenate(points).astype(np.float32),
         what_hit >= 0,
     )

@@ -5,14 +5,13 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from made_up import RESOLUTION, Ball, Wall, watch
+from made_up import RESOLUTION, ROOM, Ball, watch
 
 from stillmap import em
 from stillmap.core import chunks
 from stillmap.em.change_hmm import _group_cells
 from stillmap.mapping import detect_changes, relabel_changes
 
-WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
 CAME, LEFT, STANDS, STOOD, PASSED = 3, 4, 5, 6, 7
 SECONDS = 200
 STATES = ("last", "majority")
@@ -36,32 +35,23 @@ def histories(**changed):
     return em.CellHistories(**chosen, p_in_cell=np.ones(len(chosen["cells"]), np.float32))
 
 
-def test_last_state():
-    # what comes and goes is not there, whatever was seen at last
+def test_states_of_the_map():
+    # what comes and goes is not there at last, whatever was seen at last
     shown = histories().p_in_map("last")
     np.testing.assert_allclose(shown, [0.91, 0.9, 0.2, 0.05], atol=1e-6)
     assert shown.dtype == np.float32
     twice = histories(n_changes=np.array([0, 2, 2, 2], np.int32)).p_in_map("last")
     np.testing.assert_allclose(twice, [0.91, 0.9, 0.2, 0.05 + 0.9 * 0.9], atol=1e-6)
-
-
-def test_majority_state():
-    shown = histories().p_in_map("majority")
-    np.testing.assert_allclose(shown, [0.92, 0.1, 0.9, 0.95], atol=1e-6)
+    mostly = histories().p_in_map("majority")
+    np.testing.assert_allclose(mostly, [0.92, 0.1, 0.9, 0.95], atol=1e-6)
     half = histories(occupied_share=np.full(4, 0.5, np.float32)).p_in_map("majority")
     np.testing.assert_allclose(half, histories().p_static)
-
-
-@pytest.mark.parametrize("state", STATES)
-def test_changes_are_shown_where_the_view_may_hide(state):
-    # where both may be, what is listed as a change is shown as one
-    shown = histories().p_in_map(state)
-    half = {name: 0.5 * getattr(histories(), name) for name in ("p_static", "p_changing")}
-    np.testing.assert_allclose(
-        histories(**half, p_view_dependent=np.full(4, 0.5, np.float32)).p_in_map(state),
-        shown,
-        atol=1e-6,
-    )
+    # where the view may hide something as well, what is listed as a change is shown as one
+    unsure = {name: 0.5 * getattr(histories(), name) for name in ("p_static", "p_changing")}
+    hidden = histories(**unsure, p_view_dependent=np.full(4, 0.5, np.float32))
+    for state in STATES:
+        expected = histories().p_in_map(state)
+        np.testing.assert_allclose(hidden.p_in_map(state), expected, atol=1e-6)
 
 
 def row(p_changing, *, count=1, static=0.01, apart=1):
@@ -111,7 +101,7 @@ def seen():
         Ball(3.2, 0.0, 0, SECONDS, 0.4),
         Ball(1.5, 2.0, 20, 50, 0.3),
     ]
-    return watch([*WALLS, *things, *passing(160, 2.0), *passing(180, 1.9)], SECONDS)
+    return watch([*ROOM, *things, *passing(160, 2.0), *passing(180, 1.9)], SECONDS)
 
 
 class Everywhere(NamedTuple):
@@ -191,7 +181,7 @@ def test_change_times(seen, shown):
 def test_recurring_changes():
     times = [(t, t + 25) for t in range(0, 300, 50)]
     gate = [Ball(2.2, 0.3, *time, 0.5) for time in times]
-    watched = watch([*WALLS, *gate, *passing(35, 1.2)], 300)
+    watched = watch([*ROOM, *gate, *passing(35, 1.2)], 300)
     (p_static, _), found = final_e_step(watched)
     assert np.median(watched.of(p_static, *range(3, 3 + len(gate)))) < 0.1
     (one,) = detect_changes(found, watched.recording, RESOLUTION, 0.5)
@@ -209,7 +199,7 @@ def test_chunks_and_threads_change_no_bit(seen, shown, monkeypatch, beams, threa
     assert found.change_bins.tobytes() == of_all.change_bins.tobytes()
 
 
-@pytest.mark.parametrize(("scans", "things"), [(1, WALLS), (2, WALLS), (10, ())])
+@pytest.mark.parametrize(("scans", "things"), [(1, ROOM), (2, ROOM), (10, ())])
 def test_short_recordings_and_those_without_hits_have_no_changes(scans, things):
     watched = watch(things, scans)
     (p_static, _), found = final_e_step(watched)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import ANGLES
+from made_up import ANGLES, Ball
 from recordings import of_one_sensor
 
 from stillmap import _core, em
@@ -21,12 +21,10 @@ def seen(at, hit_mask):
     """
     directions = np.column_stack([-np.sin(ANGLES), np.cos(ANGLES)])  # a half circle to the left
     far = np.where(directions[:, 1] > 0.5, WALL / np.maximum(directions[:, 1], 0.5), np.nan)
-    ranges = np.tile(far, (len(at), 1))
-    off = np.array(POST) - np.column_stack([at, np.zeros(len(at))])
-    along = off @ directions.T
-    depth = RADIUS**2 - ((off**2).sum(axis=1)[:, None] - along**2)
-    on = (depth > 0) & (along > 0) & np.asarray(hit_mask)[:, None]
-    ranges = np.where(on, along - np.sqrt(np.maximum(depth, 0)), ranges)
+    post = Ball(*POST, 0, 0, RADIUS)
+    near = np.array([post.ranges(np.array([x, 0.0]), directions) for x in at])
+    on = np.isfinite(near) & np.asarray(hit_mask)[:, None]
+    ranges = np.where(on, near, far)
     T = se2.matrix(at, 0.0, 0.0)
     points = ranges[..., None] * directions
     recording = of_one_sensor(

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import FAR, RESOLUTION, Ball, Wall, watch
+from made_up import FAR, RESOLUTION, ROOM, Ball, Wall, at, watch
 from recordings import of_one_sensor
 
 from stillmap import _core, em
@@ -22,7 +22,7 @@ def with_lost(seen, lost, length=FAR):
 
 def room_with():
     """Three walls about the sensor, at 4 and 3 metres; the fourth side is open behind it."""
-    return watch([Wall((1, 0), 4.0), Wall((0, 1), 3.0), Wall((0, -1), 3.0)], 20)
+    return watch(ROOM, 20)
 
 
 def known(seen, threads=1):
@@ -34,13 +34,9 @@ def known(seen, threads=1):
     for a, b in zip(grid.dense(), seen.grid(e).dense(), strict=True):
         np.testing.assert_array_equal(a, b)
     m = em.make_occupancy_map(grid, found.occupied, observed)
-    first = np.round(np.array(m.origin[:2]) / RESOLUTION)
 
     def p_occupied(*points):
-        column, row = (np.floor(np.array(points) / RESOLUTION) - first).astype(int).T
-        height, width = m.p_occupied.shape
-        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        return np.where(inside, m.p_occupied[row % height, column % width], np.nan)
+        return at(m, points)
 
     def beta(*points):
         return grid.alpha_beta(np.floor(np.array(points) / RESOLUTION).astype(np.int64))[:, 1]

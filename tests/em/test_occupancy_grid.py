@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from made_up import Ball, Wall, fan, watch
+from made_up import RESOLUTION, Ball, Wall, at, fan, watch
 
 from stillmap import _core, em
 
-RESOLUTION = 0.1
 FREE = 0.2
 
 
@@ -43,21 +42,13 @@ def test_surfaces_are_added_to_passed_cells(p):
     np.testing.assert_array_equal(np.isnan(m.p_occupied), ~known)
 
 
-def at(m, points):
-    """p_occupied where these points lie; NaN outside."""
-    first = np.round(np.array(m.origin[:2]) / m.resolution).astype(int)
-    padded = np.pad(m.p_occupied, 1, constant_values=np.nan)
-    column, row = (np.floor(np.asarray(points) / m.resolution).astype(int) - first + 1).T
-    return padded[np.clip(row, 0, len(padded) - 1), np.clip(column, 0, padded.shape[1] - 1)]
-
-
 Y = np.arange(-2.0, 2.0, RESOLUTION) + RESOLUTION / 2  # of cells along a wall
 
 
 def mapped(seen):
     """The E-step, and its map."""
-    found = seen.e_step(RESOLUTION)
-    return found, em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    found = seen.e_step()
+    return found, em.make_occupancy_map(seen.grid(found.p_static), found.occupied)
 
 
 def a_room_with(wall):
@@ -98,7 +89,7 @@ def test_range_noise_fills_no_cells(y):
     seen = watch([Wall((1, 0), 4.05), post], 60, fan(721, 90), noise=0.025)
     found, m = mapped(seen)
     near = around(m, 2.05, y)
-    hits = around(em.make_occupancy_map(seen.grid(None, RESOLUTION)), 2.05, y) > 0
+    hits = around(em.make_occupancy_map(seen.grid()), 2.05, y) > 0
     assert hits.sum() >= 3
     middle = np.arange(hits.size) == hits.size // 2
     assert near[middle] > 0.8
@@ -125,7 +116,7 @@ def test_floor_under_movers_is_free():
     seen, moves, m = a_room_with(4.05)
     ends = seen.recording.points[moves]
     assert (at(m, ends) < 0.3).mean() > 0.97
-    raw = em.make_occupancy_map(seen.grid(None, RESOLUTION))
+    raw = em.make_occupancy_map(seen.grid())
     assert np.median(at(m, ends)) < np.median(at(raw, ends))
     floor = np.column_stack([np.full(20, 1.0), np.linspace(-1, 1, 20)])
     assert (at(m, floor) < 0.05).all()
@@ -145,7 +136,7 @@ def test_without_cell_probabilities_it_is_15():
 
 @pytest.mark.parametrize("printed", [False, True])
 def test_windows_and_tiles_equal_the_whole(printed, monkeypatch):
-    grid = watch([Wall([1.0, 0.0], 3.0)], 6.0, fan()).grid(None, RESOLUTION)
+    grid = watch([Wall([1.0, 0.0], 3.0)], 6.0, fan()).grid()
     occupied = None
     if not printed:
         cells = np.array([[29, 0], [30, 1], [5, 0]])  # the last one outside the part

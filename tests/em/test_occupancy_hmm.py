@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
-from rooms import ROOM, ROUTE, drive
+from made_up import RESOLUTION, ROOM, Ball, Wall, Watched, cone, fan, watch
+from rooms import ROOM as WALLS
+from rooms import ROUTE, drive
 
 from stillmap import em
 from stillmap.core import chunks
 from stillmap.em import occupancy_hmm
 from stillmap.results.eval.labels import assign_equal_width_bins, compute_calibration_error
 
-WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
-BALL = len(WALLS)  # the number of the first ball
+BALL = len(ROOM)  # the number of the first ball
 
 
 def passing(since, x=1.5, speed=1.0):
@@ -24,7 +24,7 @@ def passing(since, x=1.5, speed=1.0):
 @pytest.fixture(scope="module")
 def busy() -> Watched:
     """A room for a minute and a half: one walks past, one stands for 20 s and leaves."""
-    return watch([*WALLS, *passing(30), Ball(2.5, 1.0, 40, 60)], seconds=90)
+    return watch([*ROOM, *passing(30), Ball(2.5, 1.0, 40, 60)], seconds=90)
 
 
 @pytest.fixture(scope="module")
@@ -36,17 +36,15 @@ def test_walls_are_static_and_who_walks_or_stands_for_a_while_is_dynamic(busy, k
     walls = busy.of(known.p_static, 0, 1, 2)
     assert np.median(walls) > 0.99
     assert np.quantile(walls, 0.02) > 0.9
-    walker, stands = (
-        busy.of(known.p_static, *range(BALL, BALL + 4)),
-        busy.of(known.p_static, BALL + 4),
-    )
+    walker = busy.of(known.p_static, *range(BALL, BALL + 4))
+    stands = busy.of(known.p_static, BALL + 4)
     assert len(walker) > 30
     assert walker.max() < 0.1
     assert len(stands) > 100
     assert np.median(stands) < 0.05
     assert np.quantile(stands, 0.95) < 0.3
     for since, until in ((0, 25), (65, 90)):  # at the start, at the end
-        seen = watch([*WALLS, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
+        seen = watch([*ROOM, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
         assert np.median(seen.of(seen.e_step().p_static, BALL + 4)) < 0.2
 
 
@@ -65,7 +63,7 @@ def test_a_single_observation_has_the_prior():
     # in the last scan the sensor turns round, and sees another wall and somebody
     u = fan()
     behind = [Wall((-1, 0), 5.0), Ball(-2.0, 1.0, 0, 90)]
-    seen = watch([*WALLS, *passing(30), *behind], 60, lambda t: u if t < 59 else -u)
+    seen = watch([*ROOM, *passing(30), *behind], 60, lambda t: u if t < 59 else -u)
     found = seen.e_step()
     once = seen.of(found.p_static, BALL + 4, BALL + 5)
     assert len(once) > 20
@@ -101,7 +99,7 @@ def test_slanted_walls_are_static(slant):
 
 def test_corners_are_static():
     # the end of a wall: beside it beams go on, within a cell of its last end points
-    seen = watch([Wall((1, 0), 2.0, width=0.53), *WALLS, *passing(30)], 60, fan(361))
+    seen = watch([Wall((1, 0), 2.0, width=0.53), *ROOM, *passing(30)], 60, fan(361))
     e = seen.of(seen.e_step().p_static, 0)
     assert np.quantile(e, 0.05) > 0.8
 
@@ -176,7 +174,7 @@ def crowd():
     """Three minutes in a room with four people, at poses that are known."""
     laser = {"beams": 180, "range_noise": 0.01, "max_range": 12.0}
     route = (*ROUTE, ROUTE[0])
-    return drive(np.random.default_rng(7), ROOM, route, 4, laser=laser, robot={"scans": 500})
+    return drive(np.random.default_rng(7), WALLS, route, 4, laser=laser, robot={"scans": 500})
 
 
 def test_labels_are_calibrated(crowd):

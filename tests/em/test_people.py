@@ -16,8 +16,7 @@ def found(ranges):
 
 
 def test_two_legs_before_a_wall():
-    legs = ((3.0, 0.3, 0.07), (3.0, -0.2, 0.07))
-    seen = found(before(wall(), *legs))
+    seen = found(before(wall(), (3.0, 0.3, 0.07), (3.0, -0.2, 0.07)))
     assert seen.scan.tolist() == [0, 0]
     np.testing.assert_allclose(seen.xy, [(2.94, -0.2), (2.94, 0.3)], atol=0.03)
     np.testing.assert_allclose(seen.width, 0.14, atol=0.06)
@@ -80,22 +79,13 @@ def labelled(r):
     return label_people(r, at_origin(r)).reshape(r.n_scans, -1)
 
 
-def tracks_of(r):
-    """The tracks of people."""
-    segments = detect_segments(r, at_origin(r))
-    seconds = 1e-9 * (r.stamp_ns - r.stamp_ns[0])
-    return track_people(segments, np.ones(len(segments.scan), bool), seconds)
-
-
 def test_walkers_are_labelled_from_the_first_scan():
     ranges, on = crossing(TIMES, pillar=PILLAR)
     off = labelled(recording_of(ranges))
     assert off[on].mean() > 0.95
     assert off[0][on[0]].all()  # looking back
     assert not off[~on].any()  # wall and pillar are far from him
-
-
-def test_standing_objects_are_not_labelled():
+    # what stands is not labelled
     ranges = np.tile(before(wall(), PILLAR, (3.0, 0.0, 0.2)), (20, 1))
     rng = np.random.default_rng(0)
     assert not labelled(recording_of(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
@@ -106,7 +96,8 @@ def test_tracks_bridge_occlusion_and_end_at_the_last_detection():
     hidden = ranges.copy()
     hidden[7:10] = wall()
     hidden[14:] = wall()
-    tracks = tracks_of(recording_of(hidden))
+    segments = found(hidden)
+    tracks = track_people(segments, np.ones(len(segments.scan), bool), TIMES)
     assert len(np.unique(tracks.track)) == 1
     assert tracks.scan.tolist() == list(range(14))
     assert (~tracks.observed).nonzero()[0].tolist() == [7, 8, 9]

@@ -105,20 +105,14 @@ def test_small_dynamic_parts_do_not_move_a_cluster(things, low, high):
     np.testing.assert_array_equal(pooled(surface, p, 0 * p, recording, T), p)
 
 
-def test_ground_and_crowns_are_no_obstacles():
+def test_ground_is_no_obstacle_and_has_at_least_its_mean_p_static():
     crown = np.random.default_rng(0).uniform([-2, -2, 3.5], [2, 2, 5], (2000, 3))
     _, _, surface = standing(CAR, crown)
-    z = surface.surfels()[1][:, 2]
-    found = select_obstacles(FLAT, surface).is_obstacle
-    np.testing.assert_array_equal(found, (z > 0.2) & (z < 3.0))
-    assert 100 < found.sum() < len(z)
-
-
-def test_ground_has_at_least_its_mean_p_static():
-    _, _, surface = standing(CAR)
     obstacles = select_obstacles(FLAT, surface)
-    means = surface.surfels()[1]
-    ground = np.abs(means[:, 2]) <= obstacles.min_end_height
+    z = surface.surfels()[1][:, 2]
+    np.testing.assert_array_equal(obstacles.is_obstacle, (z > 0.2) & (z < 3.0))
+    assert 100 < obstacles.is_obstacle.sum() < len(z)
+    ground = np.abs(z) <= obstacles.min_end_height
     np.testing.assert_array_equal(obstacles.is_ground, ground)
     p, _ = labelled(surface, front)
     p[ground] = np.random.default_rng(0).uniform(0.3, 1.0, ground.sum())

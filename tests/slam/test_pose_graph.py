@@ -116,10 +116,7 @@ def test_measured_headings_bend_the_chain():
     x = se2.parameters(optimize_headings(dead_reckoned(chain), chain, measured))
     np.testing.assert_allclose(x[:, 2], [0.0, 0.0025, 0.005, 0.0075, 0.01], atol=1e-3)
     np.testing.assert_allclose(x[0], 0.0, atol=1e-12)
-
-
-def test_one_wrong_heading_counts_little():
-    chain = [Constraint(k, k + 1, se2.matrix(1.0, 0, 0), STEP) for k in range(4)]
+    # one wrong heading counts little
     measured = [HeadingMeasurement(k, 0.0 if k != 2 else 0.5, 1e-4) for k in range(5)]
     x = se2.parameters(optimize_headings(dead_reckoned(chain), chain, measured))
     assert np.abs(x[:, 2]).max() < 0.01

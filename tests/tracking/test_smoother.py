@@ -9,7 +9,6 @@ from scipy.interpolate import make_smoothing_spline
 from synthetic_tracks import watched
 
 from stillmap.tracking.association import assign_tracks
-from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.mover_path import smooth_track
 
 
@@ -68,27 +67,6 @@ def test_a_gap_of_hours_is_no_trouble():
     late = np.where(points.seconds > 4.0, points.seconds + 20_000.0, points.seconds)
     owner = assign_tracks(dataclasses.replace(points, seconds=late), 2.0)
     assert len(np.unique(owner)) == 2
-
-
-@pytest.mark.slow
-def test_large_crowds_take_a_while_and_little_memory():
-    rng = np.random.default_rng(1)
-    scans, n = 12, 2000
-    xy = rng.uniform(-20.0, 20.0, (scans * n, 2))
-    scan = np.repeat(np.arange(scans), n)
-    points = DynamicPoints(
-        0.05 * np.arange(scans),
-        scan,
-        np.arange(scans * n),
-        xy,
-        np.linalg.norm(xy, axis=1),
-        np.zeros((scans, 2)),
-        np.repeat(np.arange(scans * n // 10), 10),
-        np.arange(scans + 1) * n,
-    )
-    began = time.process_time()
-    assert assign_tracks(points, 2.0).min() >= 0
-    assert time.process_time() - began < 30.0
 
 
 def test_time_that_stands_still_forgets_no_less():
