@@ -226,8 +226,10 @@ def test_file_that_appears_meanwhile_stays(tmp_path):
 
 def test_work_of_processes_that_were_killed_long_ago_is_removed(tmp_path):
     names = [f".out.{digit * 16}.part" for digit in "abc"]
+    aside = f".out.{'a' * 16}.old"
     fill(tmp_path, {f"{names[0]}/x": "", names[1]: "", f"{names[2]}/x": "", ".out.part": ""})
-    for name in (*names[:2], ".out.part"):
+    fill(tmp_path, {f"{aside}/x": ""})
+    for name in (*names[:2], aside, ".out.part"):
         os.utime(tmp_path / name, (0, 0))
     write(tmp_path / "out")
     assert sorted(os.listdir(tmp_path)) == [names[2], ".out.part", "out"]

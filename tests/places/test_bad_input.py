@@ -81,6 +81,7 @@ def test_damaged_files_are_named(copy: Path) -> None:
         ("state/keyframes/scans.npy", lambda a: a + 1000),
         ("state/keyframes/nodes.npy", lambda a: a[::-1]),
         ("beams/offset.npy", lambda a: a[::-1]),
+        ("beams/offset.npy", lambda a: np.array([0, 2**63 - 1, int(a[-1]) + 1 - 2**63, *a[3:]])),
         ("beams/stamp_ns.npy", lambda a: a[::-1]),
     ],
 )

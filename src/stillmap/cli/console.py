@@ -202,8 +202,8 @@ def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
     return False
 
 
-# an argument in a hint for Python: of yes or no, a text, or another
-_ARGUMENT = re.compile(r"(?<![\w.])([a-z_]+)=(?:(True|False)\b|\"([^\"]*)\"|(?=\S))")
+# an argument in a hint for Python, not a part of a path: of yes or no, a text, or another
+_ARGUMENT = re.compile(r"(?<![\w./-])([a-z_]+)=(?:(True|False)\b|\"([^\"]*)\"|(?=\S))")
 _FLAGS = {"recording": "input", "name": "to"}  # of arguments with another name
 
 

@@ -25,7 +25,7 @@ PREFIX = ".stillmap."  # of hidden names inside an output
 # mount points, other disks, folders that must not be changed
 _NO_RENAME = (errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES, errno.EROFS)
 _MAX_STEM = 100  # bytes of a name to which something is added
-_RANDOM = re.compile(r"[0-9a-f]{16}\.part")
+_RANDOM = re.compile(r"[0-9a-f]{16}\.(part|old)")
 _MAX_AGE = 86_400.0  # s without a change after which work is that of a process that was killed
 _OF_DISKS = "lost+found"  # in the uppermost folder of a disk
 

@@ -181,7 +181,7 @@ _MIN_CELLS, _MIN_LISTED = {2: 5, 3: 8}, {2: 8, 3: 8}
 _NOISE = 2.5  # cells: surfaces of the same class nearer to a static one are noise of poses
 # of an object that moved: greatest distance in m, ratio of its sides and of its cells before and
 # after, m by which a side may be seen shorter
-_MAX_MOTION, _MAX_LEAF_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
+_MAX_MOTION, _MAX_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
 _BESIDE = 3.0  # cells between a change and a cell that belongs to it
 _CLEAR, _SHARE = 2.0, 0.7  # nats of a clear observation; share of them that a cell beside takes
 _WALL_MARGIN = 2.0  # m around a leaf in which its gap is looked for
@@ -377,8 +377,8 @@ def _compare_positions(
     sides = np.sort(gone.high - gone.low), np.sort(came.high - came.low)
     shorter, longer = np.minimum(*sides), np.maximum(*sides)
     count = sorted((len(gone.cells), len(came.cells)))
-    alike = bool((longer <= _MAX_LEAF_RATIO * shorter + _SIDE_SLACK).all())
-    if alike and count[1] <= 2.0 * _MAX_LEAF_RATIO * count[0] and distance <= _MAX_MOTION:
+    alike = bool((longer <= _MAX_RATIO * shorter + _SIDE_SLACK).all())
+    if alike and count[1] <= 2.0 * _MAX_RATIO * count[0] and distance <= _MAX_MOTION:
         return "moved", distance + float(np.linalg.norm(longer - shorter))
     return None, 0.0
 

@@ -180,8 +180,9 @@ def _read_beams(folder: Path) -> tuple[Int64, int]:
     """(T,) stamps of the scans of a session, and the number of its beams."""
     stamp_ns = np.array(read_array(folder / "stamp_ns.npy", (None,), np.int64))
     offset = np.array(read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64))
-    rises = offset[0] == 0 and (np.diff(offset) >= 0).all() and (np.diff(stamp_ns) >= 0).all()
-    if not len(stamp_ns) or not rises:
+    # compared, not subtracted: differences of numbers from a file may overflow
+    rises = all((column[1:] >= column[:-1]).all() for column in (offset, stamp_ns))
+    if not len(stamp_ns) or offset[0] != 0 or not rises:
         raise _inconsistent(folder)
     read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
     return stamp_ns, int(offset[-1])
