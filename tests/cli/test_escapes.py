@@ -69,12 +69,6 @@ def test_each_way_to_the_terminal(capsys):
     assert said.out.count(SHOWN) == 2
 
 
-def test_colors_stay(monkeypatch, capsys):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    say("warning: " + EVIL)
-    assert capsys.readouterr().err.startswith("stillmap: \x1b[33mwarning:\x1b[0m a\\x1b[31m")
-
-
 def test_what_is_in_a_recording(evil_recording, capsys):
     assert main(["info", str(evil_recording)]) == 0
     said = capsys.readouterr()

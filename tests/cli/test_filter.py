@@ -77,18 +77,6 @@ def test_other_formats_by_name(call, room, mapped, tmp_path, output):
     assert f"{blank.sum()} beams blanked" in done.stderr
 
 
-@pytest.mark.parametrize("form", ["kitti", "pcd"])
-def test_other_formats_of_points(call, room, mapped, tmp_path, form):
-    """They hold hits alone; what they lose is said."""
-    done = call("filter", mapped, "-o", tmp_path / "clean", "--to", form)
-    assert done.returncode == 0, done.stderr
-    before, after = stillmap_folder.read(room), read(tmp_path / "clean")
-    kept = before.hit & ~(np.load(mapped / "beams/p_static.npy") < 0.5)
-    np.testing.assert_array_equal(after.points[:, :2], before.points[kept])
-    misses = np.count_nonzero(~before.hit)
-    assert f"warning: {misses} beams without a return are left out" in done.stderr
-
-
 def test_refusals(call, room, mapped, tmp_path):
     refused(call("filter", tmp_path / "nothing", "-o", tmp_path / "c"), "nothing/run.json")
     refused(call("filter", mapped, "-o", room, "--overwrite"), "the recording itself")

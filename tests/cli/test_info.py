@@ -6,11 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from stillmap.cli.parser import parser
 from stillmap.core.camera import Camera, Images
-from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import read, write
 
@@ -188,25 +186,3 @@ def test_poses_and_images(path, tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
     assert (found["images"]["count"], found["images"]["cameras"][1]["count"]) == (5, 2)
-
-
-def test_cameras_from_a_file(tmp_path, capsys):
-    folder = tmp_path / "drive"
-    for name in ("velodyne", "image_2"):
-        (folder / name).mkdir(parents=True)
-    for k in range(2):
-        (folder / "velodyne" / f"{k}.bin").write_bytes(np.full(8, 3.0, "<f4").tobytes())
-        Image.new("RGB", (8, 6)).save(folder / "image_2" / f"{k}.png")
-    (folder / "times.txt").write_text("0\n0.1\n")
-    run(folder)
-    assert "calibrated no" in capsys.readouterr().out
-    file = tmp_path / "cameras.toml"
-    place = "translation = [0, 0, 1]\nrpy = [-1.57, 0, -1.57]\n"
-    file.write_text(f"[image_2]\nfx = 9\nfy = 9\ncx = 3.5\ncy = 2.5\n{place}")
-    run(folder, "--cameras", str(file))
-    out = capsys.readouterr().out
-    assert re.search("count +2\n +usable +2", out)
-    assert "calibrated yes, placed yes" in out
-    file.write_text("[image_3]\n")
-    with pytest.raises(InputError, match="nearest: 'image_2'"):
-        run(folder, "--cameras", str(file))

@@ -65,23 +65,3 @@ def test_config(call):
 def test_non_finite_becomes_null(capsys):
     print_json({"a": [math.nan, math.inf, 1.5], "b": {"c": -math.inf}})
     assert capsys.readouterr().out == '{"a": [null, null, 1.5], "b": {"c": null}}\n'
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("info", "nowhere"),
-        ("map", "nowhere", "-o", "out"),
-        ("filter", "nowhere", "-o", "out"),
-        ("simulate", "nowhere", "-o", "out"),
-        ("eval", "labels", "nowhere", "nowhere"),
-        ("eval", "relations", "nowhere", "nowhere"),
-        ("config", "nowhere"),
-        ("config", "--set", "no.where=1"),
-    ],
-)
-def test_errors_leave_stdout_empty(call, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = call(*words, "--json")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.count("\n") == 1

@@ -8,14 +8,6 @@ import pytest
 from stillmap.cli.main import main
 
 
-def test_version(stillmap):
-    import stillmap as package
-
-    done = stillmap("--version")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"stillmap {package.__version__}\n"
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -76,12 +76,3 @@ def test_killed_in_a_mount_point_and_resumed(mounted, hall, tmp_path, nothing_le
     assert (done.returncode, done.stderr) == (0, "")
     assert list_files(tmp_path / "disk") >= FILES
     nothing_left("disk", "out")
-
-
-@pytest.mark.slow
-def test_full_mount_point_is_one_line(mounted, room):
-    script = "mount -t tmpfs -o size=100k none out; "
-    done = mounted(f"{script} $S map $IN -o out --quiet {shlex.join(QUICK)}", IN=room)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "No space left on device" in done.stderr

@@ -157,14 +157,3 @@ def test_sessions_are_refused_and_merge_named(call, room, day_after, tmp_path, n
     nothing_left("tuesday")
     both = json.loads(call("info", room, day_after, "--json").stdout)
     assert [one["scans"] for one in both["recordings"]] == [40, 40]
-
-
-def test_inputs_that_cannot_be_read(call, room, tmp_path, nothing_left):
-    done = call("map", room, tmp_path / "gone.bag", "-o", tmp_path / "out")
-    refused(done, tmp_path / "gone.bag", "does not exist")
-    (tmp_path / "notes.txt").write_text("no recording")
-    done = call("info", room, tmp_path / "notes.txt")
-    refused(done, tmp_path / "notes.txt")
-    done = call("map", room, room.parent, "-o", room.parent, "--overwrite")
-    refused(done)
-    nothing_left("notes.txt")

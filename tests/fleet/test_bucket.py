@@ -8,7 +8,7 @@ from fleet_processes import NAMES
 from result_contents import contents
 
 from stillmap.core.errors import InputError
-from stillmap.fleet.locations import open_location
+from stillmap.fleet.inputs import open_location
 
 s3fs = pytest.importorskip("s3fs")
 pytestmark = [

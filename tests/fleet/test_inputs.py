@@ -7,8 +7,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFile
 
 from stillmap.core.errors import InputError
-from stillmap.fleet.inputs import Entry, find_sources, read_manifest, short_name
-from stillmap.fleet.locations import absolute, fetch
+from stillmap.fleet.inputs import Entry, absolute, fetch, find_sources, read_manifest, short_name
 
 FLASER = "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 host 1.0\n"
 

@@ -22,12 +22,10 @@ _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
 def uses_color(stream: IO[str]) -> bool:
-    """True if output is colored; NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM decide."""
+    """True if output is colored; NO_COLOR, FORCE_COLOR and TERM decide."""
     if os.environ.get("NO_COLOR"):
         return False
-    if os.environ.get("FORCE_COLOR") or os.environ.get("CLICOLOR_FORCE", "0") not in ("", "0"):
-        return True
-    return is_terminal(stream)
+    return bool(os.environ.get("FORCE_COLOR")) or is_terminal(stream)
 
 
 def colorize(text: str, style: str, stream: IO[str] | None) -> str:

@@ -108,8 +108,7 @@ def _read_request(args: argparse.Namespace, progress: "Show") -> "Request":
 
 def _read_entries(args: argparse.Namespace) -> "list[Entry]":
     """The recordings that the command line and the manifest name."""
-    from stillmap.fleet.inputs import Entry, read_manifest
-    from stillmap.fleet.locations import absolute
+    from stillmap.fleet.inputs import Entry, absolute, read_manifest
 
     if not args.inputs and not args.manifest:
         raise InputError("names no recording", hint="give INPUTs or --manifest FILE")

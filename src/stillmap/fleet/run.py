@@ -13,8 +13,16 @@ from stillmap.core.files import atomic_file, package_version, resolve_output, to
 from stillmap.core.input_files import hold_lock
 from stillmap.core.json import to_json
 from stillmap.core.profiling import Show
-from stillmap.fleet.inputs import Entry, Source, find_sources
-from stillmap.fleet.locations import absolute, explain, is_folder_name, is_local, open_location
+from stillmap.fleet.inputs import (
+    Entry,
+    Source,
+    absolute,
+    explain,
+    find_sources,
+    is_folder_name,
+    is_local,
+    open_location,
+)
 from stillmap.fleet.tasks import PLACES, RESULTS, STAGING, Outcome, Task, read_made, run_task
 from stillmap.results.report import template
 
@@ -344,19 +352,4 @@ def _write(root: str, name: str, text: str) -> None:
 
 def render_page(fleet: Fleet) -> str:
     """`fleet.html`: no outside request, no script; links lead to the reports beside it."""
-    return template.render_page({"fleet": fleet, "totals": _totals(fleet)}, "fleet.html.j2")
-
-
-def _totals(fleet: Fleet) -> dict[str, Any]:
-    done = [job.outcome for job in fleet.jobs if job.outcome.is_done]
-    seconds = sum(outcome.summary.get("duration_s") or 0.0 for outcome in done)
-    cpu = sum(outcome.cpu_seconds for outcome in done)
-    return {
-        "recordings": len(fleet.jobs),
-        "done": len(done),
-        "duration": seconds,
-        "bytes": sum(outcome.summary.get("bytes") or 0 for outcome in done),
-        "cpu": cpu,
-        "cpu_per_hour": cpu / seconds * 3600 if seconds else None,
-        "memory": max((outcome.peak_memory_bytes for outcome in done), default=0),
-    }
+    return template.render_page({"fleet": fleet}, "fleet.html.j2")

@@ -27,7 +27,7 @@ from stillmap.core.files import package_version, write_text
 from stillmap.core.input_files import read_text
 from stillmap.core.json import to_json
 from stillmap.core.profiling import peak_memory_bytes, reset_peak_memory
-from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location
+from stillmap.fleet.inputs import explain, fetch, hash_content, is_local, open_location
 from stillmap.results.reader import read_grid, read_run
 from stillmap.results.report.figures import data_uri, draw_map, map_window
 
