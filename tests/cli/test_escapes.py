@@ -54,7 +54,7 @@ def evil_recording(tmp_path: Path) -> Path:
 
 
 def test_printable():
-    assert printable(EVIL) == SHOWN + r"\x0ac\x0d"
+    assert printable(EVIL) == SHOWN + r"\nc\r"
     assert printable("Größe 3 µm, 日本語") == "Größe 3 µm, 日本語"
     assert str(InputError(EVIL)).startswith(SHOWN)
 

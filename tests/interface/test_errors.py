@@ -1,6 +1,7 @@
-"""Errors of the package in the terms of Python, of the command line in those of the shell."""
+"""Names of the package; its errors in the terms of Python, of the command line in the shell's."""
 
 import dataclasses
+import inspect
 import sys
 
 import numpy as np
@@ -74,3 +75,18 @@ def test_a_missing_library_is_named(built, monkeypatch, module, call):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(stillmap.MissingExtra, match=r"pip install .*\[notebook\]"):
         call(built)
+
+
+def test_every_name_is_there_and_listed():
+    assert set(stillmap.__all__) <= set(dir(stillmap))
+    assert [name for name in stillmap.__all__ if not hasattr(stillmap, name)] == []
+    assert stillmap.__all__ == sorted(stillmap.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'buidl'"):
+        stillmap.buidl  # noqa: B018
+
+
+def test_build_says_what_it_takes():
+    signature = inspect.signature(stillmap.build)
+    assert list(signature.parameters)[:2] == ["recording", "options"]
+    keywords = [p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    assert keywords == ["resolution", "odometry", "poses", "progress", "scratch"]

@@ -1,7 +1,6 @@
 """InputError, the one exception for invalid input or calls, and import of optional libraries."""
 
 import errno
-import re
 from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
@@ -20,22 +19,14 @@ def split_advice(warning: str) -> tuple[str, str]:
     return what, todo
 
 
-# C0, C1 and delete; line and paragraph separators; marks that change the order of characters
-_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-
-
 def printable(text: str) -> str:
-    """The text on one line, with control characters as escapes.
+    """The text on one line, with characters that are not printed as escapes.
 
     Names of files, topics and frames may hold any, with which a terminal changes its colors, its
-    title or lines above.
+    title or lines above, or the order of characters.
     """
-    return _CONTROL.sub(_escape, text)
-
-
-def _escape(match: re.Match[str]) -> str:
-    number = ord(match[0])
-    return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}"
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(shown)
 
 
 def install_command(group: str) -> str:
