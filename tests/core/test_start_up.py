@@ -6,7 +6,10 @@ import sys
 import pytest
 
 # each takes a tenth of a second or more to load, or leads to what does
-HEAVY = ("gtsam", "jinja2", "matplotlib", "rosbags", "scipy", "stillmap.mesh.build", "trimesh")
+HEAVY = (
+    *("gtsam", "jinja2", "matplotlib", "rosbags"),
+    *("scipy.sparse", "scipy.spatial", "stillmap.mesh.build", "trimesh"),
+)
 
 
 def loaded(code, *arguments):
