@@ -68,6 +68,11 @@ def cone(side: int = 25, width: float = 90.0) -> Any:
 ROOM = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
 
 
+def passing(since: float, x: float = 1.5) -> list[Ball]:
+    """Walks past along y, each second in another place."""
+    return [Ball(x, -2.4 + k, since + k, since + k + 1) for k in range(5)]
+
+
 def at(m: em.OccupancyMap, points: Any, layer: Any = None) -> Any:
     """p_occupied, or a layer like it, where these points lie; NaN outside."""
     first = np.round(np.array(m.origin[:2]) / m.resolution).astype(int)

@@ -5,7 +5,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from made_up import RESOLUTION, ROOM, Ball, watch
+from made_up import RESOLUTION, ROOM, Ball, passing, watch
 
 from stillmap import em
 from stillmap.core import chunks
@@ -85,11 +85,6 @@ def test_cells_outside_groups_are_unchanged():
     assert same(row(THIRD, count=3))  # it comes and goes
     assert same(row(THIRD, static=0.5))
     assert same(row([0.9, 0.9, 0.9, *[0.02] * 10]))  # most have no say
-
-
-def passing(since, x):
-    """Walks past along y, each second in another place."""
-    return [Ball(x, -2.4 + k, since + k, since + k + 1) for k in range(5)]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import RESOLUTION, ROOM, Ball, Wall, Watched, cone, fan, watch
+from made_up import RESOLUTION, ROOM, Ball, Wall, Watched, cone, fan, passing, watch
 from rooms import ROOM as WALLS
 from rooms import ROUTE, drive
 
@@ -14,11 +14,6 @@ from stillmap.em import occupancy_hmm
 from stillmap.results.eval.labels import assign_equal_width_bins, compute_calibration_error
 
 BALL = len(ROOM)  # the number of the first ball
-
-
-def passing(since, x=1.5, speed=1.0):
-    """Walks past along y, a metre per second."""
-    return [Ball(x, -2.4 + speed * k, since + k, since + k + 1) for k in range(int(4.8 / speed))]
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +31,8 @@ def test_walls_are_static_and_who_walks_or_stands_for_a_while_is_dynamic(busy, k
     walls = busy.of(known.p_static, 0, 1, 2)
     assert np.median(walls) > 0.99
     assert np.quantile(walls, 0.02) > 0.9
-    walker = busy.of(known.p_static, *range(BALL, BALL + 4))
-    stands = busy.of(known.p_static, BALL + 4)
+    walker = busy.of(known.p_static, *range(BALL, BALL + 5))
+    stands = busy.of(known.p_static, BALL + 5)
     assert len(walker) > 30
     assert walker.max() < 0.1
     assert len(stands) > 100
@@ -45,7 +40,7 @@ def test_walls_are_static_and_who_walks_or_stands_for_a_while_is_dynamic(busy, k
     assert np.quantile(stands, 0.95) < 0.3
     for since, until in ((0, 25), (65, 90)):  # at the start, at the end
         seen = watch([*ROOM, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
-        assert np.median(seen.of(seen.e_step().p_static, BALL + 4)) < 0.2
+        assert np.median(seen.of(seen.e_step().p_static, BALL + 5)) < 0.2
 
 
 def test_fitted_parameters(busy, known):
@@ -65,7 +60,7 @@ def test_a_single_observation_has_the_prior():
     behind = [Wall((-1, 0), 5.0), Ball(-2.0, 1.0, 0, 90)]
     seen = watch([*ROOM, *passing(30), *behind], 60, lambda t: u if t < 59 else -u)
     found = seen.e_step()
-    once = seen.of(found.p_static, BALL + 4, BALL + 5)
+    once = seen.of(found.p_static, BALL + 5, BALL + 6)
     assert len(once) > 20
     assert once == pytest.approx(found.learned["p_static"], abs=1e-6)
     assert np.ptp(found.p_static) > 0.9

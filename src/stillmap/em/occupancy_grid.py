@@ -95,7 +95,7 @@ def make_occupancy_map(
         ValueError: the grid is 3D.
     """
     if not isinstance(grid, _core.OccupancyGrid2D):
-        raise ValueError("grid: expected one of 2 dimensions")
+        raise ValueError("grid: expected 2 dimensions")
     if observed is not None:
         window = GridWindow(observed.first_cell, observed.mask.shape)
     if window is None:
