@@ -5,22 +5,9 @@ import pytest
 from made_up import RESOLUTION, Ball, Wall, at, fan, watch
 
 from stillmap import _core, em
+from stillmap.core import se2
 
 FREE = 0.2
-
-
-def laid_out(p_occupied, cells=((0, 0), (1, 0)), hits=1):
-    """A lane of five cells: hits end in cell 3, cell 4 and all beside it stay unknown."""
-    grid = _core.OccupancyGrid2D(1.0)
-    T = np.eye(3)[None].copy()
-    T[0, :2, 2] = 0.5
-    points = np.tile(np.array([[3, 0]], np.float32), (hits, 1))
-    e = np.full(hits, 0.5, np.float32)
-    _core.add_beams(grid, points, np.ones(hits, bool), e, np.array([0, hits]), T)
-    occupied = em.CellProbabilities(
-        np.array(cells, np.int64).reshape(-1, 2), np.array(p_occupied, np.float32), FREE
-    )
-    return em.make_occupancy_map(grid, occupied)
 
 
 def odds_after(length):
@@ -30,7 +17,13 @@ def odds_after(length):
 
 @pytest.mark.parametrize("p", [0.0, 0.3, 1.0])
 def test_surfaces_are_added_to_passed_cells(p):
-    m = laid_out([p], [(3, 0)], hits=4)
+    """Four hits end in cell 3 of a lane of five cells; cell 4 and all beside it stay unknown."""
+    grid = _core.OccupancyGrid2D(1.0)
+    points, e = np.tile(np.array([[3, 0]], np.float32), (4, 1)), np.full(4, 0.5, np.float32)
+    T = se2.matrix([0.5], 0.5, 0.0)
+    _core.add_beams(grid, points, np.ones(4, bool), e, np.array([0, 4]), T)
+    occupied = em.CellProbabilities(np.array([[3, 0]]), np.array([p], np.float32), FREE)
+    m = em.make_occupancy_map(grid, occupied)
     row, column = -round(m.origin[1]), -round(m.origin[0])
     lane = m.p_occupied[row, column : column + 5]
     # the first cell was passed over half its length
@@ -158,16 +151,14 @@ def test_windows_and_tiles_equal_the_whole(printed, monkeypatch):
 
 def rooms(*corners):
     """The grid of a robot in rooms of 4 m at corners (2,), and its positions."""
-    grid, places = _core.OccupancyGrid2D(0.05), []
+    grid = _core.OccupancyGrid2D(0.05)
     angle = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
     points = (2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.float32)
-    for corner in corners:
-        T = np.eye(3)[None].copy()
-        T[0, :2, 2] = corner
-        places.append(T[0, :2, 2])
-        every = np.ones(len(points), bool), np.ones(len(points), np.float32)
+    every = np.ones(len(points), bool), np.ones(len(points), np.float32)
+    for x, y in corners:
+        T = se2.matrix([float(x)], float(y), 0.0)
         _core.add_beams(grid, points, *every, np.array([0, len(points)]), T)
-    return grid, np.array(places)
+    return grid, np.array(corners, float)
 
 
 def test_a_far_room_is_left_out():

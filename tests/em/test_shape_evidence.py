@@ -3,7 +3,6 @@
 import functools
 
 import numpy as np
-import pytest
 
 from stillmap import em
 from stillmap.core.chunks import ScanBeams
@@ -26,11 +25,6 @@ def corridor(name, scans):
     return simulate(scene_by_name(name, {"robot": {"scans": scans}}), 3)
 
 
-@pytest.fixture
-def crowd():
-    return corridor("corridor-crowd", 250)
-
-
 @functools.cache
 def label(simulation, threads=1, *, with_shapes=True):
     recording, poses, options = simulation.recording, simulation.truth.T_world_base, em.EmOptions()
@@ -40,42 +34,25 @@ def label(simulation, threads=1, *, with_shapes=True):
     return found.p_static
 
 
-@pytest.fixture
-def found(crowd):
-    return label(crowd)
-
-
-@pytest.fixture
-def by_history(crowd):
-    return label(crowd, with_shapes=False)
-
-
 def log_loss(p, static):
     p = np.clip(p.astype(float), 1e-4, 1.0 - 1e-4)
     return -float(np.mean(np.log(np.where(static, p, 1.0 - p))))
 
 
-def test_labels_are_better_than_by_history_alone(crowd, found, by_history):
+def test_labels_are_better_than_by_history_alone():
+    crowd = corridor("corridor-crowd", 250)
     hit, static = crowd.recording.hit, crowd.truth.static[crowd.recording.hit]
-    assert log_loss(found[hit], static) < 0.98 * log_loss(by_history[hit], static)
-    wrong = [np.mean((p[hit] >= 0.5) != static) for p in (found, by_history)]
-    assert wrong[0] < wrong[1]
-
-
-def test_shapes_never_raise_p_static(crowd, found, by_history):
-    """Leaves of doors have the shape of walls."""
-    hit = crowd.recording.hit
-    assert (found[hit] <= by_history[hit]).all()
-    assert np.mean(found[hit] < by_history[hit]) > 0.01
-
-
-def test_people_seen_for_a_moment_are_no_obstacles(crowd, found, by_history):
-    """Places without a history that tells, where people were."""
-    hit = crowd.recording.hit
-    unsure = hit & (by_history > 0.3) & (by_history < 0.7)
-    people = unsure & ~crowd.truth.static
+    found, by_history = label(crowd)[hit], label(crowd, with_shapes=False)[hit]
+    assert log_loss(found, static) < 0.98 * log_loss(by_history, static)
+    assert np.mean((found >= 0.5) != static) < np.mean((by_history >= 0.5) != static)
+    # shapes never raise P(static): leaves of doors have the shape of walls
+    assert (found <= by_history).all()
+    assert np.mean(found < by_history) > 0.01
+    # people who are seen for a moment, in places without a history that tells
+    people = (by_history > 0.3) & (by_history < 0.7) & ~static
     assert people.sum() > 50
     assert np.mean(found[people] >= 0.5) < 0.6 * np.mean(by_history[people] >= 0.5)
+    assert label(crowd, threads=3)[hit].tobytes() == found.tobytes()
 
 
 def test_where_nobody_is_nothing_changes():
@@ -86,11 +63,8 @@ def test_where_nobody_is_nothing_changes():
     np.testing.assert_allclose(last, without, atol=0.2)
 
 
-def test_threads_change_nothing(crowd, found):
-    assert label(crowd, threads=3).tobytes() == found.tobytes()
-
-
-def test_shares_of_segments(crowd):
+def test_shares_of_segments():
+    crowd = corridor("corridor-crowd", 250)
     recording, poses = crowd.recording, crowd.truth.T_world_base
     surfels = em.observations.build_surfel_map(recording, poses, RESOLUTION)
     shares = count_segments(surfels, recording, poses)
