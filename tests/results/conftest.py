@@ -11,11 +11,12 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
 from stillmap.core.source import RangeRule, Source
-from stillmap.em import Coverage
+from stillmap.em import Coverage, OccupancyMap
+from stillmap.pipeline.em_loop import IterationRecord
 from stillmap.pipeline.options import OutputOptions
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.snapshots import choose_window, extent, snapshot
-from stillmap.slam import BareStretch, Diagnostics
+from stillmap.slam import BareStretch, Diagnostics, LoopClosure
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.tracking import FlowMap, MovingObject, ObjectOptions, compute_flow_map
@@ -54,35 +55,6 @@ class FakeOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class FakeMap:
-    p_occupied: np.ndarray
-    alpha: np.ndarray
-    beta: np.ndarray
-    origin: tuple[float, float, float]
-    resolution: float
-
-
-@dataclass(frozen=True)
-class FakeIteration:
-    number: int
-    expected_log_likelihood: float
-    bound: float
-    changed_share: float
-    seconds: float
-    held_out_log_likelihood: float | None = None
-    touched_share: float = 0.3
-    source: str = ""
-
-
-@dataclass(frozen=True)
-class FakeLoop:
-    earlier: int
-    later: int
-    explained: float
-    rejected: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class FakeResult:
     recording: Recording
     options: FakeOptions
@@ -90,8 +62,8 @@ class FakeResult:
     snapshots: list
     poses: np.ndarray
     p_static: np.ndarray
-    map: FakeMap
-    raw_map: FakeMap
+    map: OccupancyMap
+    raw_map: OccupancyMap
     evidence: Coverage
     best_iteration: int
     converged: bool
@@ -175,7 +147,7 @@ def _count(poses, points, hit, e):
         np.add.at(beta, (i[hit[t]], j[hit[t]]), 1 - e[t][hit[t]])
     with np.errstate(invalid="ignore"):
         p = (alpha / (alpha + beta)).astype(np.float32)
-    return FakeMap(p, alpha, beta, ORIGIN, RESOLUTION)
+    return OccupancyMap(p, ORIGIN, RESOLUTION, alpha, beta)
 
 
 RULE = RangeRule(12.0, "12 m repeats (919 x)", "unusable", "", 12.0, "", 0.0)
@@ -186,9 +158,7 @@ SOURCE = {
         {
             "name": "FLASER",
             "beams_per_scan": 181,
-            "ranges": asdict(
-                RangeRule(12.0, "12 m repeats (919 x)", "unusable", "", 12.0, "", 0.0)
-            ),
+            "ranges": asdict(RULE),
             "start_angle": -1.5708,
         }
     ],
@@ -290,16 +260,17 @@ def result():
     labels = {number: v.reshape(-1).astype(np.float32) for number, v in ((1, first), (3, e))}
     window = choose_window(extent(maps[3]), maps[3].resolution, world[labels[3] < 0.5], 8.0)
     objects = made_up_objects(recording, e.reshape(-1), np.repeat(np.arange(T), N))
+    none = (np.eye(3), np.eye(3))  # pose and covariance of loops
     return FakeResult(
         objects=objects,
         traffic=compute_flow_map(objects),
         recording=recording,
         options=FakeOptions(),
         iterations=[
-            FakeIteration(1, -41234.5, -40211.0, 1.0, 1.9),
-            FakeIteration(2, -32100.25, -31500.5, 0.08, 1.8),
-            FakeIteration(3, -30800.0, -30300.0, 0.01, 1.7),
-            FakeIteration(4, -30950.0, float("nan"), 0.002, 1.7),
+            IterationRecord(1, -41234.5, -40211.0, 1.0, 1.9),
+            IterationRecord(2, -32100.25, -31500.5, 0.08, 1.8),
+            IterationRecord(3, -30800.0, -30300.0, 0.01, 1.7),
+            IterationRecord(4, -30950.0, float("nan"), 0.002, 1.7),
         ],
         snapshots=[
             snapshot(n, maps[k], world[labels[k] < 0.5], window)
@@ -315,10 +286,10 @@ def result():
         warnings=["the odometry stalls at line 88 & <after>"],
         learned=LEARNED,
         loops=[
-            FakeLoop(2, 40, 0.75),
-            FakeLoop(4, 42, 0.5, "explains too little"),
-            FakeLoop(5, 44, 0.9, "other loops disagree"),
-            FakeLoop(6, 46, 0.25, "explains too little"),
+            LoopClosure(2, 40, *none, 0.75),
+            LoopClosure(4, 42, *none, 0.5, "explains too little"),
+            LoopClosure(5, 44, *none, 0.9, "other loops disagree"),
+            LoopClosure(6, 46, *none, 0.25, "explains too little"),
         ],
         graph=_graph(poses),
         doubts=Diagnostics(

@@ -54,26 +54,6 @@ def parsed(path):
     return rows
 
 
-def chi2(rows):
-    """Of g2o's EDGE_SE2: e = (Z^-1 (Xi^-1 Xj)) as a vector, e' I e, with plain trigonometry."""
-    at = {int(id_): (x, y, theta) for id_, x, y, theta in rows["VERTEX_SE2"]}
-
-    def seen_from(a, b):
-        c, s = np.cos(a[2]), np.sin(a[2])
-        dx, dy = b[0] - a[0], b[1] - a[1]
-        turn = b[2] - a[2]
-        return c * dx + s * dy, c * dy - s * dx, np.arctan2(np.sin(turn), np.cos(turn))
-
-    out = []
-    for i, j, x, y, theta, *upper in rows["EDGE_SE2"]:
-        information = np.zeros((3, 3))
-        information[np.triu_indices(3)] = upper
-        information = information + information.T - np.diag(np.diag(information))
-        e = np.array(seen_from((x, y, theta), seen_from(at[int(i)], at[int(j)])))
-        out.append(e @ information @ e)
-    return np.array(out)
-
-
 def test_what_is_written(tmp_path, graph):
     write_g2o(tmp_path / "graph.g2o", graph, all_poses(graph))
     rows = parsed(tmp_path / "graph.g2o")
@@ -90,16 +70,7 @@ def test_what_is_written(tmp_path, graph):
         np.testing.assert_allclose(row[5:], expected, rtol=1e-9)
 
 
-def test_the_errors_that_g2o_sees_are_ours(tmp_path, graph):
-    poses = all_poses(graph, np.random.default_rng(1), 0.3)
-    write_g2o(tmp_path / "graph.g2o", graph, poses)
-    found = chi2(parsed(tmp_path / "graph.g2o"))
-    expected = squared_mahalanobis(poses[graph.keyframes], graph.constraints)
-    assert expected.min() > 1
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-def test_gtsam_reads_the_same_errors(tmp_path, graph):
+def test_gtsam_reads_our_errors(tmp_path, graph):
     # small ones: those of GTSAM go along the curve of a turn
     exact = [
         dataclasses.replace(r, T=se2.inverse(graph.poses[r.first]) @ graph.poses[r.second])
@@ -111,21 +82,8 @@ def test_gtsam_reads_the_same_errors(tmp_path, graph):
     factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), False)
     assert factors.size() == len(graph.constraints)
     errors = [2.0 * factors.at(k).error(values) for k in range(factors.size())]
-    np.testing.assert_allclose(errors, chi2(parsed(tmp_path / "graph.g2o")), rtol=1e-2)
-
-
-def test_gtsam_finds_the_poses_again(tmp_path, graph):
-    # the vertices are elsewhere: the edges alone have to say
-    poses = all_poses(graph, np.random.default_rng(2), 0.1)
-    write_g2o(tmp_path / "graph.g2o", graph, poses)
-    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), False)
-    fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*se2.parameters(poses[0])), fixed))
-    found = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
-    at = [found.atPose2(int(scan)) for scan in graph.keyframes]
-    T = se2.matrix(*np.array([[p.x(), p.y(), p.theta()] for p in at]).T)
-    assert np.abs(poses[graph.keyframes] - graph.poses).max() > 0.05
-    np.testing.assert_allclose(T, graph.poses, atol=1e-4)
+    expected = squared_mahalanobis(poses[graph.keyframes], graph.constraints)
+    np.testing.assert_allclose(errors, expected, rtol=1e-2)
 
 
 def test_one_scan_is_a_graph_without_edges(tmp_path):

@@ -75,7 +75,7 @@ def test_iterations(tmp_path, result):
         "expected_log_likelihood": -32100.25,
         "held_out_log_likelihood": None,
         "changed_share": 0.08,
-        "touched_share": 0.3,
+        "touched_share": 1.0,
         "seconds": 1.8,
     }
     assert iterations[3]["bound"] is None  # not a number there

@@ -50,16 +50,17 @@ def test_the_folder_is_complete_and_agrees_with_itself(tmp_path, result):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_no_graph_no_file(tmp_path, result):
-    save(dataclasses.replace(result, graph=None), tmp_path / "out")
-    assert set(contents(tmp_path / "out")) == FILES - {"graph.g2o"}
+def test_files_follow_the_options(tmp_path, result):
+    def written(**changes):
+        options = dataclasses.replace(result.options, **changes)
+        save(dataclasses.replace(result, options=options, graph=None), tmp_path / "out", True)
+        return set(contents(tmp_path / "out"))
 
-
-def test_objects_that_were_not_asked_for_have_no_files(tmp_path, result):
-    options = dataclasses.replace(result.options, objects=ObjectOptions(enabled=False))
-    save(dataclasses.replace(result, options=options), tmp_path / "out")
-    left_out = {name for name in FILES if name.startswith(("objects/", "traffic"))}
-    assert set(contents(tmp_path / "out")) == FILES - left_out
+    assert written() == FILES - {"graph.g2o"}
+    moving = {name for name in FILES if name.startswith(("objects/", "traffic"))}
+    assert written(objects=ObjectOptions(enabled=False)) == FILES - moving - {"graph.g2o"}
+    scale = written(output=OutputOptions(map_mode="scale"))
+    assert scale == FILES - {"graph.g2o", "map.pgm"} | {"map.png"}
 
 
 def test_same_result_same_bytes_except_for_timings(tmp_path, result):
@@ -70,12 +71,6 @@ def test_same_result_same_bytes_except_for_timings(tmp_path, result):
     a, b, c = (contents(tmp_path / name) for name in "abc")
     assert a == b
     assert {name for name in FILES if a[name] != c[name]} == {"run.json", "report.html"}
-
-
-def test_map_mode_comes_from_the_options(tmp_path, result):
-    options = dataclasses.replace(result.options, output=OutputOptions(map_mode="scale"))
-    save(dataclasses.replace(result, options=options), tmp_path / "out")
-    assert set(contents(tmp_path / "out")) == FILES - {"map.pgm"} | {"map.png"}
 
 
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError, MemoryError])

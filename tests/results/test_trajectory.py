@@ -35,21 +35,6 @@ def test_lines(tmp_path):
         np.testing.assert_allclose([turned.real, turned.imag], pose[:2, 0], atol=5e-9)
 
 
-def test_evo_reads_the_same(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        file_interface = pytest.importorskip("evo.tools.file_interface")
-    write_tum(tmp_path / "t.tum", STAMPS, POSES)
-    trajectory = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
-    np.testing.assert_allclose(trajectory.timestamps, STAMPS / 1e9, rtol=1e-15)
-    read = np.array(trajectory.poses_se3)
-    np.testing.assert_allclose(read[:, :2, 3], POSES[:, :2, 2], atol=1e-9)
-    np.testing.assert_allclose(read[:, :2, :2], POSES[:, :2, :2], atol=5e-9)
-
-
 @given(st.lists(st.integers(-MAX_STAMP_NS, MAX_STAMP_NS), min_size=1, max_size=20))
 def test_stamps_survive_exactly(tmp_path_factory, stamps):
     path = tmp_path_factory.mktemp("tum") / "t.tum"
