@@ -7,32 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_topics import assert_grid, convert, decode_mcap, nanoseconds, placed
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
-from stillmap.cli.main import main
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.table import read_columns
 from stillmap.io.trajectory import read_tum
-
-
-def convert(result, path, *more):
-    assert main(["convert", str(result), "-o", str(path), "--quiet", *more]) == 0
-    return path
-
-
-def nanoseconds(message):
-    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-
-
-def matrix(transform):
-    T, q, t = np.eye(4), transform.rotation, transform.translation
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = t.x, t.y, t.z
-    return T
 
 
 def vertices(cloud):
@@ -65,17 +48,7 @@ def ply_points(folder):
 
 @pytest.fixture(scope="module")
 def decoded(mapped_street):
-    """Messages by topic, decoded by the schemas in the file alone."""
-    reader_of = pytest.importorskip("mcap.reader").make_reader
-    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
-    path = convert(mapped_street, mapped_street.parent / "street.mcap")
-    topics = defaultdict(list)
-    with path.open("rb") as file:
-        for _, channel, message, ros in reader_of(
-            file, validate_crcs=True, decoder_factories=[decoder]
-        ).iter_decoded_messages():
-            topics[channel.topic].append((message.log_time, ros))
-    return topics
+    return decode_mcap(mapped_street)[1]
 
 
 @pytest.mark.slow
@@ -100,7 +73,7 @@ def test_sweeps_by_the_frames_are_the_clouds(decoded, mapped_street):
         T = np.eye(4)
         for one in (*tf.transforms, mount):
             assert one is mount or nanoseconds(one) == nanoseconds(cloud)
-            T = T @ matrix(one.transform)
+            T = T @ placed(one.transform)
         points = vertices(cloud)
         assert points.dtype.names == ("x", "y", "z", "p_static")
         xyz = np.stack([points[axis] for axis in "xyz"], 1).astype(float)
@@ -118,7 +91,7 @@ def test_odom_frame_is_the_recordings(decoded, street, mapped_street):
     recording = stillmap_folder.read(street)
     _, poses = read_tum(mapped_street / "trajectory.tum")
     for t, (stamp, tf) in enumerate(decoded["/tf"]):
-        T_map_odom, T_odom_base = (matrix(one.transform) for one in tf.transforms)
+        T_map_odom, T_odom_base = (placed(one.transform) for one in tf.transforms)
         assert stamp == recording.stamp_ns[t]
         np.testing.assert_allclose(T_odom_base, recording.T_odom_base[t], atol=1e-9)
         np.testing.assert_allclose(T_map_odom @ T_odom_base, poses[t], atol=1e-7)
@@ -126,11 +99,7 @@ def test_odom_frame_is_the_recordings(decoded, street, mapped_street):
 
 def test_map_and_static_points(decoded, mapped_street):
     [(_, grid)], [(_, cloud)] = decoded["/map"], decoded["/static_points"]
-    with np.load(mapped_street / "map.npz") as archive:
-        p = archive["p_occupied"]
-    cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
-    np.testing.assert_array_equal(cells == -1, np.isnan(p))
-    assert np.abs(cells - 100 * p)[cells >= 0].max() <= 0.501
+    assert_grid(grid, mapped_street)
     points = vertices(cloud)
     assert cloud.header.frame_id == "map"
     expected = ply_points(mapped_street)
@@ -224,5 +193,5 @@ def test_without_odometry_odom_is_map(street, mapped_street, tmp_path):
         connections = [c for c in reader.connections if c.topic == "/tf"]
         for t, (connection, _, raw) in enumerate(reader.messages(connections)):
             map_odom, odom_base = reader.deserialize(raw, connection.msgtype).transforms
-            np.testing.assert_array_equal(matrix(map_odom.transform), np.eye(4))
-            np.testing.assert_allclose(matrix(odom_base.transform), poses[t], atol=1e-9)
+            np.testing.assert_array_equal(placed(map_odom.transform), np.eye(4))
+            np.testing.assert_allclose(placed(odom_base.transform), poses[t], atol=1e-9)

@@ -4,37 +4,18 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from bag_topics import assert_grid, convert, decode_mcap, matrix, nanoseconds
 
-from stillmap.cli.main import main
 from stillmap.io.trajectory import poses_from_tum
 
 
 @pytest.fixture(scope="module")
 def decoded(result):
-    """Summary and messages by topic, decoded by the schemas in the file alone."""
-    reader_of = pytest.importorskip("mcap.reader").make_reader
-    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
-    path = result.parent / "result.mcap"
-    assert main(["convert", str(result), "-o", str(path), "--quiet"]) == 0
-    topics = defaultdict(list)
-    with path.open("rb") as file:
-        reader = reader_of(file, validate_crcs=True, decoder_factories=[decoder])
-        summary = reader.get_summary()
-        for _, channel, message, ros in reader.iter_decoded_messages():
-            topics[channel.topic].append((message.log_time, ros))
-    return summary, topics
+    return decode_mcap(result)
 
 
-def nanoseconds(header):
-    return header.stamp.sec * 10**9 + header.stamp.nanosec
-
-
-def matrix(translation, q):
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = translation.x, translation.y, translation.z
-    return T[np.ix_([0, 1, 3], [0, 1, 3])]
+def planar(translation, q):
+    return matrix(translation, q)[np.ix_([0, 1, 3], [0, 1, 3])]
 
 
 @pytest.mark.slow
@@ -81,7 +62,7 @@ def test_frames_form_a_tree(decoded):
             parts = getattr(message, "transforms", getattr(message, "markers", [message]))
             for part in parts:
                 assert part.header.frame_id in {"map", *parents}, topic
-                assert nanoseconds(part.header) == time
+                assert nanoseconds(part) == time
                 assert getattr(part, "child_frame_id", "odom") in parents
 
 
@@ -112,15 +93,15 @@ def test_trajectory_topic(decoded, result, recording):
     _, topics = decoded
     poses = poses_from_tum(result / "trajectory.tum", recording)
     [(_, path)] = topics["/trajectory"]
-    found = [matrix(p.pose.position, p.pose.orientation) for p in path.poses]
+    found = [planar(p.pose.position, p.pose.orientation) for p in path.poses]
     np.testing.assert_allclose(found, poses, atol=1e-12)
-    assert [nanoseconds(p.header) for p in path.poses] == recording.stamp_ns.tolist()
+    assert [nanoseconds(p) for p in path.poses] == recording.stamp_ns.tolist()
     for t, (time, tf) in enumerate(topics["/tf"]):
         assert time == recording.stamp_ns[t]
         names = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
         assert names == [("map", "odom"), ("odom", "base_link")]
         T_map_odom, T_odom_base = (
-            matrix(one.transform.translation, one.transform.rotation) for one in tf.transforms
+            planar(one.transform.translation, one.transform.rotation) for one in tf.transforms
         )
         np.testing.assert_allclose(T_map_odom @ T_odom_base, poses[t], atol=1e-12)
         np.testing.assert_allclose(T_odom_base, recording.T_odom_base[t], atol=1e-12)
@@ -135,20 +116,13 @@ def test_odometry_topic(decoded, recording):
     ):
         assert (time, odometry.child_frame_id) == (stamp, "base_link")
         pose = odometry.pose.pose
-        np.testing.assert_allclose(matrix(pose.position, pose.orientation), T, atol=1e-12)
+        np.testing.assert_allclose(planar(pose.position, pose.orientation), T, atol=1e-12)
 
 
 def test_map_topic(decoded, result):
     _, topics = decoded
     [(_, grid)] = topics["/map"]
-    with np.load(result / "map.npz") as archive:
-        p, origin, resolution = (archive[n] for n in ("p_occupied", "origin", "resolution"))
-    cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
-    np.testing.assert_array_equal(cells == -1, np.isnan(p))
-    assert np.abs(cells - 100 * p)[cells >= 0].max() <= 0.501
-    assert grid.info.resolution == np.float32(resolution)
-    place = grid.info.origin.position
-    np.testing.assert_allclose([place.x, place.y], origin[:2])
+    assert_grid(grid, result)
 
 
 def test_object_markers(decoded, result):
@@ -183,9 +157,7 @@ def test_object_markers(decoded, result):
 def test_parquet_table(result, recording):
     """In the map frame: static end points lie on the walls of the map."""
     parquet = pytest.importorskip("pyarrow.parquet")
-    path = result.parent / "beams.parquet"
-    assert main(["convert", str(result), "-o", str(path), "--quiet", "--overwrite"]) == 0
-    read = parquet.read_table(path)
+    read = parquet.read_table(convert(result, result.parent / "beams.parquet", "--overwrite"))
     table = {name: read[name].to_numpy() for name in read.column_names}
     assert len(table["scan"]) == recording.n_beams
     with np.load(result / "map.npz") as archive:
