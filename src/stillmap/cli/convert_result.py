@@ -81,9 +81,9 @@ def _convert_to_nav2(
     nav2.write(maps, output, result.output_options.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
-        written.append(f"keep-out zones of {maps.keepout_area:.1f} m2")
+        written.append(f"keep-out zones of {maps.area(maps.keepout):.1f} m2")
     if maps.speed is not None:
-        written.append(f"speed limits on {maps.slow_area:.1f} m2")
+        written.append(f"speed limits on {maps.area(maps.speed):.1f} m2")
     return maps.warnings, ", ".join(written)
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.config import to_dict
 from stillmap.core.files import package_version
 from stillmap.core.json import to_jsonable
-from stillmap.core.tiles import Layer, tiles_of
+from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.em_loop import IterationRecord
@@ -97,13 +97,10 @@ def quality_record(quality: Quality) -> dict[str, float | None]:
 def known_area(result: MappingResult) -> dict[str, float]:
     """`known`: m2 of the map of which beams tell something; `thin`: of these on thin evidence."""
     cell = float(result.map.resolution) ** 2
-    known = _count(result.map.p_occupied, lambda p: ~np.isnan(p))
-    thin = _count(result.evidence.thinly_observed, lambda thin: thin)
+    layers = tiles_of(result.map.p_occupied), tiles_of(result.evidence.thinly_observed)
+    known = sum(int(np.count_nonzero(~np.isnan(part))) for _, part in layers[0])
+    thin = sum(int(np.count_nonzero(part)) for _, part in layers[1])
     return {"known": round(cell * known, 6), "thin": round(cell * thin, 6)}
-
-
-def _count(layer: Layer, select: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> int:
-    return sum(int(np.count_nonzero(select(part))) for _, part in tiles_of(layer))
 
 
 def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:

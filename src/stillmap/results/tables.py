@@ -130,22 +130,17 @@ def _pose_columns(result: MappedPlace) -> dict[str, NDArray[Any]]:
 def _object_columns(result: MappedPlace) -> dict[str, Any]:
     """A row per object: `id`, `first_stamp_ns`, `last_stamp_ns`, `length`, `width`, in 3D `height`
     (m), `distance` (m along its track), `speed` (m/s, mean), `beams`, `p_dynamic`, `p_identity`."""
-    objects = result.objects
-    sides = ("length", "width", "height")[: result.poses.shape[-1] - 1]
-    return {
-        "id": np.array([one.id for one in objects], np.int64),
-        "first_stamp_ns": np.array([one.stamp_ns[0] for one in objects], np.int64),
-        "last_stamp_ns": np.array([one.stamp_ns[-1] for one in objects], np.int64),
-        **{
-            side: np.array([one.size[k] for one in objects], np.float64)
-            for k, side in enumerate(sides)
-        },
-        "distance": np.array([track_length(one.xy) for one in objects], np.float64),
-        "speed": np.array([mean_speed(one.velocity) for one in objects], np.float64),
-        "beams": np.array([_count_beams(one) for one in objects], np.int64),
-        "p_dynamic": np.array([one.p_dynamic for one in objects], np.float64),
-        "p_identity": np.array([one.p_identity for one in objects], np.float64),
-    }
+    sides, rows = ("length", "width", "height")[: result.poses.shape[-1] - 1], []
+    for one in result.objects:
+        first, last, beams = one.stamp_ns[0], one.stamp_ns[-1], _count_beams(one)
+        way = track_length(one.xy), mean_speed(one.velocity)
+        size = one.size[: len(sides)]
+        rows.append((one.id, first, last, *size, *way, beams, one.p_dynamic, one.p_identity))
+    names = ("id", "first_stamp_ns", "last_stamp_ns", *sides, "distance", "speed", "beams")
+    names += ("p_dynamic", "p_identity")
+    columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
+    kinds = dict.fromkeys(("id", "first_stamp_ns", "last_stamp_ns", "beams"), np.int64)
+    return {name: np.array(c, kinds.get(name, np.float64)) for name, c in columns.items()}
 
 
 def _track_columns(result: MappedPlace) -> dict[str, NDArray[Any]]:

@@ -1,12 +1,13 @@
 """Scores of P(static) per beam against the truth. The positive class is *dynamic*."""
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from stillmap.core.json import to_jsonable
 
 Float = NDArray[np.float64]
 
@@ -19,15 +20,8 @@ class Scores:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of plain numbers; NaN becomes None, since JSON has no NaN."""
-        return {key: _plain(value) for key, value in dataclasses.asdict(self).items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+        scores: dict[str, Any] = to_jsonable(dataclasses.asdict(self))
+        return scores
 
 
 # One certain error costs 13.8 nats. Labels are float32: anything below 6e-8 is lost near 1 anyway.

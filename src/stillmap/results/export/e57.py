@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
@@ -126,34 +125,25 @@ class _Columns:
         nodes["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
         if cloud.has_colors:
             nodes |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLORS}
-        self._values: dict[str, NDArray[np.float64]] = {}
+        self._values = [np.zeros(_BLOCK) for _ in nodes]
         self.buffers = library.VectorSourceDestBuffer()
-        for name, node in nodes.items():
+        for (name, node), values in zip(nodes.items(), self._values, strict=True):
             self.prototype.set(name, node)
-            self._values[name] = np.zeros(_BLOCK)
-            self.buffers.append(
-                library.SourceDestBuffer(file, name, self._values[name], _BLOCK, True, True)
-            )
+            self.buffers.append(library.SourceDestBuffer(file, name, values, _BLOCK, True, True))
 
     def fill(self, block: Block) -> Iterator[int]:
         """Fill the buffers with the points, block by block; yields the number of points in them."""
-        for first in range(0, len(block.points), _BLOCK):
-            part = slice(first, min(first + _BLOCK, len(block.points)))
-            n, points = part.stop - part.start, block.points[part]
+        for part in block.split(_BLOCK):
+            n, points = len(part.points), part.points
             if np.abs(points - self._origin).max() >= MAX_INTEGER * SCALE:
-                raise InputError(
-                    "cannot be written: a point is beyond the range of E57 coordinates"
-                )
+                what = "cannot be written: a point is beyond the range of E57 coordinates"
+                raise InputError(what)
             self._low = np.minimum(self._low, points.min(axis=0))
             self._high = np.maximum(self._high, points.max(axis=0))
-            for name, column in zip(_AXES, points.T, strict=True):
-                self._values[name][:n] = column
-            self._values["intensity"][:n] = block.p_static[part]
-            if block.colors is not None:
-                for name, column in zip(_COLORS, block.colors[part].T, strict=True):
-                    self._values[name][:n] = column
-            for column in self._values.values():
-                self.digest.update(column[:n].data)
+            columns = [*points.T, part.p_static, *(() if part.colors is None else part.colors.T)]
+            for buffer, column in zip(self._values, columns, strict=True):
+                buffer[:n] = column
+                self.digest.update(buffer[:n].data)
             yield n
 
     def bounds(self) -> dict[str, float]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.pipeline.options import MapMode
-from stillmap.results.export.zones import SpeedLimit, Zone, cells_inside, is_within
+from stillmap.results.export.zones import Action, SpeedLimit, Zone, cells_inside, is_within
 from stillmap.results.map_server import write_keepout_mask, write_map_server, write_speed_mask
 from stillmap.results.reader import Crossings, Grid
 
@@ -115,17 +115,9 @@ class Maps:
     code: MaskCode = NO_LIMITS
     warnings: list[str] = field(default_factory=list)
 
-    @property
-    def keepout_area(self) -> float:
-        """m2."""
-        count = 0 if self.keepout is None else int(np.count_nonzero(self.keepout))
-        return count * self.map.resolution**2
-
-    @property
-    def slow_area(self) -> float:
-        """m2 with a speed limit."""
-        count = 0 if self.speed is None else int(np.count_nonzero(self.speed))
-        return count * self.map.resolution**2
+    def area(self, mask: NDArray[Any]) -> float:
+        """m2 of the cells of a mask that are not 0."""
+        return int(np.count_nonzero(mask)) * self.map.resolution**2
 
 
 def make_maps(
@@ -158,30 +150,21 @@ def make_maps(
         maps.keepout = np.zeros(shape, bool)
     if limits:
         maps.speed = np.zeros(shape, np.uint8)
-    if crossings is not None:
-        _add_traffic(maps, rule, crossings)
+    traffic: list[tuple[int | None, Action, SpeedLimit | None, str]] = [
+        (rule.keepout, "keepout", None, "keep-out"),
+        (rule.slow, "speed", rule.limit, "slow"),
+    ]
+    for least, action, limit, kind in traffic:
+        if least is not None and crossings is not None:
+            cells = _cells_of_squares(crossings.number >= least, crossings, grid)
+            if not cells.any():
+                most = int(crossings.number.max(initial=0))
+                what = f"no square of the floor was crossed {least} times, at most {most}"
+                maps.warnings.append(f"{what}: traffic makes no {kind} zones")
+            _edit(maps, Zone(_TRAFFIC, action, limit, []), cells)
     for zone in zones:
         _add_zone(maps, zone)
     return maps
-
-
-def _add_traffic(maps: Maps, rule: TrafficRule, crossings: Crossings) -> None:
-    """Keep out of, and limit the speed in, the squares that were crossed often."""
-    if rule.keepout is not None and maps.keepout is not None:
-        maps.keepout |= _find_crossed_cells(maps, crossings, rule.keepout, "keep-out")
-    if rule.slow is not None and maps.speed is not None:
-        cells = _find_crossed_cells(maps, crossings, rule.slow, "slow")
-        maps.speed[cells] = maps.code.encode(rule.limit, _TRAFFIC)
-
-
-def _find_crossed_cells(maps: Maps, crossings: Crossings, least: int, kind: str) -> Mask:
-    """(H, W) cells in squares that were crossed at least so often; warns if there are none."""
-    cells = _cells_of_squares(crossings.number >= least, crossings, maps.map)
-    if not cells.any():
-        most = int(crossings.number.max(initial=0))
-        what = f"no square of the floor was crossed {least} times, at most {most}"
-        maps.warnings.append(f"{what}: traffic makes no {kind} zones")
-    return cells
 
 
 def _cells_of_squares(squares: Mask, crossings: Crossings, grid: Grid) -> Mask:
@@ -198,26 +181,27 @@ def _cells_of_squares(squares: Mask, crossings: Crossings, grid: Grid) -> Mask:
 
 
 def _add_zone(maps: Maps, zone: Zone) -> None:
-    p_occupied, count = maps.map.p_occupied, 0
+    cells = np.zeros(maps.map.p_occupied.shape, bool)
     for polygon in zone.polygons:
         window, inside = cells_inside(polygon, maps.map)
-        count += int(np.count_nonzero(inside))
-        if zone.action == "erase":
-            p_occupied[window][inside] = 0.0
-        elif zone.action == "block":
-            p_occupied[window][inside] = 1.0
-        if maps.keepout is not None and zone.action != "speed":
-            maps.keepout[window][inside] = zone.action != "erase"
-        if maps.speed is not None and zone.action in ("erase", "speed"):
-            limit = zone.limit
-            value = 0 if limit is None else maps.code.encode(limit, zone.where)
-            maps.speed[window][inside] = value
-    if not count:
-        raise InputError(
-            "holds no cell of the map", where=zone.where, hint=f"the map: {_extent(maps.map)}"
-        )
+        cells[window] |= inside
+    if not cells.any():
+        hint = f"the map: {_extent(maps.map)}"
+        raise InputError("holds no cell of the map", where=zone.where, hint=hint)
     if not all(is_within(polygon, maps.map) for polygon in zone.polygons):
         maps.warnings.append(f"{zone.where} reaches beyond the map: only the part on it counts")
+    _edit(maps, zone, cells)
+
+
+def _edit(maps: Maps, zone: Zone, cells: Mask) -> None:
+    """Do with cells (H, W) what a zone says."""
+    if zone.action in ("erase", "block"):
+        maps.map.p_occupied[cells] = float(zone.action == "block")
+    if maps.keepout is not None and zone.action != "speed":
+        maps.keepout[cells] = zone.action != "erase"
+    if maps.speed is not None and zone.action in ("erase", "speed"):
+        limit = zone.limit
+        maps.speed[cells] = 0 if limit is None else maps.code.encode(limit, zone.where)
 
 
 def _extent(grid: Grid) -> str:

@@ -44,25 +44,6 @@ _FILES = {
     "run.json": "record of this run",
 }
 _NO_MORE: Mapping[str, str] = {}
-# what the stages of a run do
-_STAGES = {
-    "read": "reading the recording",
-    "calibration": "calibrating mounts and odometry",
-    "m_step": "estimating poses",
-    "e_step": "labelling beams",
-    "held_out": "testing on scans left out of the map",
-    "quality": "rating the quality",
-    "changes": "finding changed places",
-    "maps": "making the maps",
-    "evidence": "counting observations",
-    "objects": "tracking moving objects",
-    "tilting": "labelling the second laser",
-    "surface": "making the surface",
-    "painting": "choosing pictures for the surface",
-    "texture": "making textures",
-    "movers": "modelling moving objects",
-    "points": "coloring points",
-}
 
 
 def render_report(
@@ -152,7 +133,7 @@ def _stages_data(result: MappingResult) -> list[tuple[str, float, int]]:
     """Name, seconds and peak memory in bytes of each stage."""
     return [
         (
-            _STAGES.get(name, name.replace("_", " ")),
+            name.replace("_", " "),
             float(stage.get("seconds") or 0),
             int(stage.get("peak_memory_bytes") or 0),
         )
