@@ -1,6 +1,5 @@
 """Writes ROS bags of any kind, message by message, and the messages of recordings and results."""
 
-import os
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
@@ -10,26 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces, rosbag1, rosbag2
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from stillmap.core import files
 from stillmap.core.errors import InputError
-from stillmap.core.files import (
-    atomic_file,
-    atomic_folder,
-    resolve_output,
-    shorten,
-    temporary_folder,
-)
 from stillmap.core.recording import Recording
 from stillmap.io import laser_scan
 from stillmap.io.ros.messages import (
@@ -43,7 +29,10 @@ from stillmap.io.ros.messages import (
 )
 
 Float = NDArray[np.float64]
-Send = Callable[[int, Any], None]  # stamp in ns, message
+# of a message, by name: those that are zero or empty may be missing, those that a kind of bag does
+# not have are left out
+Fields = dict[str, Any]
+Send = Callable[[int, Fields], None]  # stamp in ns, message
 SendRaw = Callable[[int, bytes], None]
 
 BASE, ODOM, MAP = "base_link", "odom", "map"
@@ -55,15 +44,15 @@ _FLOAT32 = 7  # of sensor_msgs/PointField
 # the oldest version that stores message definitions: ROS 2 before Jazzy reads no newer one
 _VERSION: Literal[8] = 8
 _MAX_SECONDS = {"bag": 1 << 32, "ros2": 1 << 31, "db3": 1 << 31, "mcap": 1 << 31}  # of stamps
-_FOREVER = QosTime(9223372036, 854775807)
-_TRANSIENT_LOCAL = Qos(
-    QosHistory.KEEP_LAST,
+_FOREVER = interfaces.QosTime(9223372036, 854775807)
+_TRANSIENT_LOCAL = interfaces.Qos(
+    interfaces.QosHistory.KEEP_LAST,
     1,
-    QosReliability.RELIABLE,
-    QosDurability.TRANSIENT_LOCAL,
+    interfaces.QosReliability.RELIABLE,
+    interfaces.QosDurability.TRANSIENT_LOCAL,
     _FOREVER,
     _FOREVER,
-    QosLiveliness.AUTOMATIC,
+    interfaces.QosLiveliness.AUTOMATIC,
     _FOREVER,
     False,
 )
@@ -86,9 +75,13 @@ class BagWriter:
             type: as `sensor_msgs/msg/LaserScan`.
             latched: late subscribers still get the last message.
         """
-        writer, serialize = self._writer, self._serialize
         connection = self._add_connection(name, type, latched, typestore=self._store)
-        return lambda stamp, message: writer.write(connection, stamp, serialize(message, type))
+
+        def send(stamp_ns: int, fields: Fields) -> None:
+            raw = self.serialize(self._make(type, fields), type)
+            self._writer.write(connection, stamp_ns, raw)
+
+        return send
 
     def copy_topic(self, channel: Channel) -> SendRaw | None:
         """Add a topic like one of another bag; returns a function that writes raw messages.
@@ -114,20 +107,22 @@ class BagWriter:
         """The bytes of a message in this kind of bag."""
         return bytes(self._serialize(message, type))
 
-    def make(self, type: str, /, **fields: Any) -> Any:
-        """A message or a part of one."""
-        return self._store.types[type](**fields)
+    def _make(self, type: str, fields: Fields) -> Any:
+        definition = self._store.fielddefs[type][1]
+        values = {name: self._value(kind, fields.get(name)) for name, kind in definition}
+        return self._store.types[type](**values)
 
-    def time(self, stamp_ns: int) -> Any:
-        """A time; never negative."""
-        sec, nanosec = divmod(stamp_ns, 10**9)
-        return self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-
-    def header(self, stamp_ns: int, frame: str) -> Any:
-        """The header of a message."""
-        seq = {"seq": 0} if self.is_ros1 else {}
-        stamp = self.time(stamp_ns)
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **seq)
+    def _value(self, kind: Any, given: Any) -> Any:
+        """A field: messages of their fields, anything else as it is given; zero where it is not."""
+        node, form = kind
+        if node == Nodetype.NAME:
+            return self._make(form, given or {})
+        if node == Nodetype.BASE:
+            return given if given is not None else "" if form[0] == "string" else 0
+        (item, name), count = form
+        if item == Nodetype.NAME:
+            return [self._make(name, fields) for fields in given or ()]
+        return np.zeros(count, name[0]) if given is None else given
 
     def _add_connection(self, topic: str, type: str, latched: bool, **options: Any) -> Any:
         if self.is_ros1:
@@ -166,39 +161,32 @@ def new_bag(
     """
     with ExitStack() as stack:
         if kind == "ros2":
-            work = stack.enter_context(atomic_folder(path, "metadata.yaml", overwrite))
+            work = stack.enter_context(files.atomic_folder(path, "metadata.yaml", overwrite))
+            name = files.shorten(files.resolve_output(path).name)
         else:
-            work = stack.enter_context(atomic_file(path))
+            work, name = stack.enter_context(files.atomic_file(path)), "bag"
         # rosbags refuses existing files; for ROS 2 it makes a folder, and names its files after it
-        beside = stack.enter_context(temporary_folder(path))
-        stack.enter_context(_sqlite_errors(path))
-        if kind == "bag":
-            with rosbag1.Writer(beside / "bag") as writer1:
-                yield BagWriter(kind, writer1)
-            os.replace(beside / "bag", work)
-            return
-        mcap |= kind == "mcap"
-        plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
-        folder = beside / (shorten(resolve_output(path).name) if kind == "ros2" else "bag")
-        writer2 = rosbag2.Writer(folder, version=_VERSION, storage_plugin=plugin)
-        if mcap:
-            compression = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
-            writer2.set_compression(*compression)
-        with writer2:
-            yield BagWriter(kind, writer2)
+        made = stack.enter_context(files.temporary_folder(path)) / name
+        try:
+            with _open_writer(made, kind, mcap or kind == "mcap") as writer:
+                yield BagWriter(kind, writer)
+        except sqlite3.Error as error:  # a full disk
+            raise InputError(f"cannot be written: {error}", where=str(path)) from error
         if kind == "ros2":
-            for file in folder.iterdir():
+            for file in made.iterdir():
                 shutil.move(file, work / file.name)
         else:
-            shutil.move(folder / f"{folder.name}.{kind}", work)
+            shutil.move(made if kind == "bag" else made / f"{name}.{kind}", work)
 
 
-@contextmanager
-def _sqlite_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:  # a full disk
-        raise InputError(f"cannot be written: {error}", where=str(path)) from error
+def _open_writer(path: Path, kind: BagKind, mcap: bool) -> rosbag1.Writer | rosbag2.Writer:
+    if kind == "bag":
+        return rosbag1.Writer(path)
+    plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
+    writer = rosbag2.Writer(path, version=_VERSION, storage_plugin=plugin)
+    if mcap:
+        writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+    return writer
 
 
 def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
@@ -213,120 +201,93 @@ def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
         raise InputError(f"{span} do not fit into a ROS bag", hint=hint)
 
 
-def make_point_cloud(bag: BagWriter, stamp_ns: int, frame: str, vertices: NDArray[np.void]) -> Any:
+def make_header(stamp_ns: int, frame: str) -> Fields:
+    """The header of a message."""
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
+
+
+def make_point_cloud(stamp_ns: int, frame: str, vertices: NDArray[np.void]) -> Fields:
     """A PointCloud2 of vertices (n,), whose fields are 4 bytes each; x, y and z in metres.
 
     All are called FLOAT32, as PCL does with the packed colour of `rgb`, 0x00RRGGBB.
     """
     names = vertices.dtype.names or ()
-    fields = [
-        bag.make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
-        for k, name in enumerate(names)
-    ]
     step = vertices.dtype.itemsize
     if step != 4 * len(names):
         raise ValueError(f"vertices: {vertices.dtype} has other fields than of 4 bytes")
-    return bag.make(
-        POINT_CLOUD,
-        header=bag.header(stamp_ns, frame),
-        height=1,
-        width=len(vertices),
-        fields=fields,
-        is_bigendian=False,
-        point_step=step,
-        row_step=step * len(vertices),
-        data=np.ascontiguousarray(vertices).view(np.uint8).ravel(),
-        is_dense=all(bool(np.isfinite(vertices[axis]).all()) for axis in "xyz"),
-    )
+    return {
+        "header": make_header(stamp_ns, frame),
+        "height": 1,
+        "width": len(vertices),
+        "fields": [
+            {"name": name, "offset": 4 * k, "datatype": _FLOAT32, "count": 1}
+            for k, name in enumerate(names)
+        ],
+        "point_step": step,
+        "row_step": step * len(vertices),
+        "data": np.ascontiguousarray(vertices).view(np.uint8).ravel(),
+        "is_dense": all(bool(np.isfinite(vertices[axis]).all()) for axis in "xyz"),
+    }
 
 
-def make_transforms(bag: BagWriter, stamp_ns: int, poses: list[tuple[str, str, Float]]) -> Any:
+def make_transforms(stamp_ns: int, poses: list[tuple[str, str, Float]]) -> Fields:
     """A TFMessage of transforms (parent, child, T_parent_child (D+1, D+1))."""
-    transforms = []
-    for parent, child, T in poses:
-        translation, rotation = _split(bag, T, "Vector3")
-        transforms.append(
-            bag.make(
-                "geometry_msgs/msg/TransformStamped",
-                header=bag.header(stamp_ns, parent),
-                child_frame_id=child,
-                transform=bag.make(
-                    "geometry_msgs/msg/Transform", translation=translation, rotation=rotation
-                ),
-            )
-        )
-    return bag.make(TF, transforms=transforms)
-
-
-def make_odometry(bag: BagWriter, stamp_ns: int, T_odom_base: Float) -> Any:
-    """An Odometry message with the pose alone: velocities and covariances are 0."""
-    zero = bag.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    twist = bag.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
-    unknown, pose = np.zeros(36), make_pose(bag, T_odom_base)
-    return bag.make(
-        ODOMETRY,
-        header=bag.header(stamp_ns, ODOM),
-        child_frame_id=BASE,
-        pose=bag.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=unknown),
-        twist=bag.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
-    )
-
-
-def make_path(bag: BagWriter, stamp_ns: NDArray[np.int64], poses: Float) -> Any:
-    """A Path in the map frame along T_map_base (T, D+1, D+1)."""
-    headers = [bag.header(stamp, MAP) for stamp in stamp_ns.tolist()]
-    stamped = [
-        bag.make("geometry_msgs/msg/PoseStamped", header=header, pose=make_pose(bag, T))
-        for header, T in zip(headers, poses, strict=True)
+    transforms = [
+        {
+            "header": make_header(stamp_ns, parent),
+            "child_frame_id": child,
+            "transform": make_pose(T, "translation", "rotation"),
+        }
+        for parent, child, T in poses
     ]
-    return bag.make(PATH, header=headers[0], poses=stamped)
+    return {"transforms": transforms}
+
+
+def make_odometry(stamp_ns: int, T_odom_base: Float) -> Fields:
+    """An Odometry message with the pose alone: velocities and covariances are 0."""
+    header, pose = make_header(stamp_ns, ODOM), {"pose": make_pose(T_odom_base)}
+    return {"header": header, "child_frame_id": BASE, "pose": pose}
+
+
+def make_path(stamp_ns: NDArray[np.int64], poses: Float) -> Fields:
+    """A Path in the map frame along T_map_base (T, D+1, D+1)."""
+    stamped = [
+        {"header": make_header(stamp, MAP), "pose": make_pose(T)}
+        for stamp, T in zip(stamp_ns.tolist(), poses, strict=True)
+    ]
+    return {"header": stamped[0]["header"], "poses": stamped}
 
 
 def make_occupancy_grid(
-    bag: BagWriter,
-    stamp_ns: int,
-    p_occupied: NDArray[np.floating[Any]],
-    T_map_corner: Float,
-    resolution: float,
-) -> Any:
+    stamp_ns: int, p_occupied: NDArray[np.floating[Any]], T_map_corner: Float, resolution: float
+) -> Fields:
     """An OccupancyGrid in percent, -1 where p_occupied (H, W) is NaN; row 0 is the lowest y.
 
     T_map_corner (3, 3) is the pose of its lower-left corner, resolution in metres.
     """
-    known = ~np.isnan(p_occupied)
-    percent = np.where(known, np.rint(100.0 * np.where(known, p_occupied, 0.0)), -1.0)
-    info = bag.make(
-        "nav_msgs/msg/MapMetaData",
-        map_load_time=bag.time(stamp_ns),
-        resolution=resolution,
-        width=p_occupied.shape[1],
-        height=p_occupied.shape[0],
-        origin=make_pose(bag, T_map_corner),
-    )
-    data = percent.astype(np.int8).ravel()
-    return bag.make(GRID, header=bag.header(stamp_ns, MAP), info=info, data=data)
+    header, (height, width) = make_header(stamp_ns, MAP), p_occupied.shape
+    info = {
+        "map_load_time": header["stamp"],
+        "resolution": resolution,
+        "width": width,
+        "height": height,
+        "origin": make_pose(T_map_corner),
+    }
+    percent = np.nan_to_num(np.rint(100.0 * p_occupied), nan=-1.0)
+    return {"header": header, "info": info, "data": percent.astype(np.int8).ravel()}
 
 
-def make_pose(bag: BagWriter, T: Float) -> Any:
-    """A Pose of T (D+1, D+1)."""
-    position, orientation = _split(bag, T, "Point")
-    return bag.make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
-
-
-def _split(bag: BagWriter, T: Float, kind: str) -> tuple[Any, Any]:
-    """Translation, as a Point or Vector3, and rotation as a Quaternion with w >= 0."""
+def make_pose(T: Float, position: str = "position", orientation: str = "orientation") -> Fields:
+    """A Pose of T (D+1, D+1), or what names its two parts otherwise; its quaternion has w >= 0."""
     D = len(T) - 1
-    x, y, z = (*T[:D, D].tolist(), 0.0)[:3]
     if D == 2:
         half = np.arctan2(T[1, 0], T[0, 0]) / 2
-        q = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+        q = [0.0, 0.0, float(np.sin(half)), float(np.cos(half))]
     else:
-        q = tuple(Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist())
-    turn = dict(zip("xyzw", q, strict=True))
-    return (
-        bag.make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z),
-        bag.make("geometry_msgs/msg/Quaternion", **turn),
-    )
+        q = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
+    at = dict(zip("xyz", T[:D, D].tolist(), strict=False))
+    return {position: at, orientation: dict(zip("xyzw", q, strict=True))}
 
 
 def write_recording(
@@ -357,11 +318,11 @@ def write_recording(
             send_odometry(t)
             sensor, beams = int(recording.sensor[t]), recording.beams_of(t)
             if lasers is None:
-                message = _make_cloud(bag, recording, t, frames[sensor])
+                message = _make_cloud(recording, t, frames[sensor])
                 free = recording.points[beams][~recording.hit[beams]]
                 n_free += int(np.count_nonzero(~np.isnan(free).any(axis=1)))
             else:
-                message = lasers.make_message(bag, t, frames[sensor], lasers.ranges(t))
+                message = lasers.make_message(t, frames[sensor], lasers.ranges(t))
             sends[sensor](int(stamps[t]), message)
     lost = [f"{n_free} beams at maximum range are left out: they have no points"] * bool(n_free)
     return lost if lasers is None else lasers.describe_losses()
@@ -384,22 +345,18 @@ class LaserScanEncoder:
         """(n,) metres of a scan, +inf at maximum range, NaN where unusable."""
         return laser_scan.beam_ranges(self._recording, t, np.inf).astype(np.float32)
 
-    def make_message(self, bag: BagWriter, t: int, frame: str, ranges: NDArray[np.float32]) -> Any:
+    def make_message(self, t: int, frame: str, ranges: NDArray[np.float32]) -> Fields:
         """The message of scan t with ranges (n,)."""
         start, step = self._angles[t].tolist()
-        return bag.make(
-            LASER_SCAN,
-            header=bag.header(int(self._recording.stamp_ns[t]), frame),
-            angle_min=start,
-            angle_max=start + step * max(len(ranges) - 1, 0),
-            angle_increment=step,
-            time_increment=float(self._time_increments[t]),
-            scan_time=0.0,
-            range_min=0.0,
-            range_max=self._range_max[self._recording.sensor[t]],
-            ranges=ranges,
-            intensities=np.empty(0, np.float32),
-        )
+        return {
+            "header": make_header(int(self._recording.stamp_ns[t]), frame),
+            "angle_min": start,
+            "angle_max": start + step * max(len(ranges) - 1, 0),
+            "angle_increment": step,
+            "time_increment": float(self._time_increments[t]),
+            "range_max": self._range_max[self._recording.sensor[t]],
+            "ranges": ranges,
+        }
 
     def describe_losses(self) -> list[str]:
         """Lists the parts of a recording that ROS messages cannot hold, one sentence each."""
@@ -418,7 +375,7 @@ def write_sensor_frames(
     if recording.n_scans:
         first = int(recording.stamp_ns[0])
         poses = [(BASE, f, T) for f, T in zip(frames, recording.T_base_sensor, strict=True)]
-        send(first, make_transforms(bag, first, [*poses, *more]))
+        send(first, make_transforms(first, [*poses, *more]))
     return frames
 
 
@@ -439,13 +396,13 @@ def _odometry_sender(bag: BagWriter, recording: Recording) -> Callable[[int], No
         stamp, T = int(recording.stamp_ns[t]), T_odom_base[t]
         if t and stamp == recording.stamp_ns[t - 1] and np.array_equal(T, T_odom_base[t - 1]):
             return  # two sensors at the same time
-        send_tf(stamp, make_transforms(bag, stamp, [(ODOM, BASE, T)]))
-        send_odometry(stamp, make_odometry(bag, stamp, T))
+        send_tf(stamp, make_transforms(stamp, [(ODOM, BASE, T)]))
+        send_odometry(stamp, make_odometry(stamp, T))
 
     return send
 
 
-def _make_cloud(bag: BagWriter, recording: Recording, t: int, frame: str) -> Any:
+def _make_cloud(recording: Recording, t: int, frame: str) -> Fields:
     """A PointCloud2 with field `t`, in seconds after the stamp, where beams have times."""
     beams, times = recording.beams_of(t), recording.beam_time
     names = "xyz" if times is None else "xyzt"
@@ -455,4 +412,4 @@ def _make_cloud(bag: BagWriter, recording: Recording, t: int, frame: str) -> Any
     vertices["x"], vertices["y"], vertices["z"] = points.T
     if times is not None:
         vertices["t"] = times[beams]
-    return make_point_cloud(bag, int(recording.stamp_ns[t]), frame, vertices)
+    return make_point_cloud(int(recording.stamp_ns[t]), frame, vertices)

@@ -19,6 +19,7 @@ from stillmap.io.ros.writer import (
     MAP,
     ODOM,
     BagWriter,
+    Fields,
     LaserScanEncoder,
     new_bag,
     number_names,
@@ -45,7 +46,7 @@ _BOX_COLOR = (0.9, 0.4, 0.0, 0.8)  # RGBA, the orange of the report
 _TEXT_COLOR = (1.0, 1.0, 1.0, 1.0)  # RViz and Foxglove have a dark background
 _HEIGHT, _MIN_SIZE = 0.5, 0.1  # m, of the boxes: height in 2D, least edge
 _TEXT_HEIGHT, _TEXT_GAP = 0.3, 0.25  # m, of a letter, and above the box
-_CUBE, _TEXT, _ADD, _DELETE_ALL = 1, 9, 0, 3  # of visualization_msgs/Marker
+_CUBE, _TEXT, _DELETE_ALL = 1, 9, 3  # of visualization_msgs/Marker
 
 
 def write(
@@ -110,12 +111,9 @@ def _write_latched_topics(bag: BagWriter, result: MappedPlace) -> None:
     first = int(stamp_ns[0])
     send = bag.add_topic("/map", ros.GRID, latched=True)
     corner = se2.matrix(*grid.origin)
-    send(
-        first,
-        ros.make_occupancy_grid(bag, first, grid.p_occupied, corner, grid.resolution),
-    )
+    send(first, ros.make_occupancy_grid(first, grid.p_occupied, corner, grid.resolution))
     send = bag.add_topic("/trajectory", ros.PATH, latched=True)
-    send(first, ros.make_path(bag, stamp_ns, result.poses))
+    send(first, ros.make_path(stamp_ns, result.poses))
 
 
 def _write_static_points(
@@ -131,13 +129,13 @@ def _write_static_points(
     send = bag.add_topic("/static_points", POINT_CLOUD, latched=True)
     block = cloud.sample(_MAX_POINTS)
     block = block._replace(points=near.points_to_local(block.points))
-    send(first, _make_cloud(bag, first, _LOCAL if near.is_shifted else MAP, block))
+    send(first, _make_cloud(first, _LOCAL if near.is_shifted else MAP, block))
 
 
-def _make_cloud(bag: BagWriter, stamp_ns: int, frame: str, block: Block) -> Any:
+def _make_cloud(stamp_ns: int, frame: str, block: Block) -> Fields:
     """A PointCloud2 of points in a frame: x, y, z, `p_static`, and `rgb` for colours."""
     fields = FIELDS if block.colors is None else FIELDS + PACKED_COLOUR
-    return ros.make_point_cloud(bag, stamp_ns, frame, make_vertices(block, fields))
+    return ros.make_point_cloud(stamp_ns, frame, make_vertices(block, fields))
 
 
 def _make_scan_writer(
@@ -156,7 +154,7 @@ def _make_scan_writer(
         is_dynamic = recording.hit[beams] & (p_static[beams] < DYNAMIC_BELOW)
         for sends, selected in ((static, ~is_dynamic), (dynamic, is_dynamic)):
             part = np.where(selected, ranges, np.float32(np.nan))
-            sends[s](stamp, encoder.make_message(bag, t, frames[s], part))
+            sends[s](stamp, encoder.make_message(t, frames[s], part))
 
     return write_scan
 
@@ -174,7 +172,7 @@ def _make_sweep_writer(
         colors = None if result.colors is None else result.colors[beams][hit]
         points = deskewed.points[beams][hit].astype(np.float64)
         block = Block(points, result.p_static[beams][hit], None, colors)
-        sends[s](stamp, _make_cloud(bag, stamp, frames[s], block))
+        sends[s](stamp, _make_cloud(stamp, frames[s], block))
 
     return write_sweep
 
@@ -192,9 +190,9 @@ def _make_frame_writer(bag: BagWriter, result: MappedPlace) -> ScanWriter:
             T = T_odom_base[t]
             T_map_odom = T_map_base @ se2.inverse(T)
         poses = [(MAP, ODOM, T_map_odom), (ODOM, BASE, T)]
-        send_tf(stamp, ros.make_transforms(bag, stamp, poses))
+        send_tf(stamp, ros.make_transforms(stamp, poses))
         if send_odometry is not None:
-            send_odometry(stamp, ros.make_odometry(bag, stamp, T))
+            send_odometry(stamp, ros.make_odometry(stamp, T))
 
     return write_frames
 
@@ -215,15 +213,15 @@ def _make_object_writer(
         if not before and not shown:
             return
         stamp = int(stamp_ns[t])
-        markers = [_make_marker(bag, stamp, {"action": _DELETE_ALL})]
+        markers = [_make_marker(stamp, action=_DELETE_ALL)]
         for n in shown:
-            markers += _markers_of(bag, stamp, tracks[n])
-        send(stamp, bag.make(ros.MARKERS, markers=markers))
+            markers += _markers_of(stamp, tracks[n])
+        send(stamp, {"markers": markers})
 
     return write_markers
 
 
-def _markers_of(bag: BagWriter, stamp: int, track: Mover) -> list[Any]:
+def _markers_of(stamp: int, track: Mover) -> list[Fields]:
     """Box and number of an object at the interpolated pose of its track."""
     T = interpolate_pose(track, stamp)
     length, width, height = (max(edge, _MIN_SIZE) for edge in (*track.size, _HEIGHT)[:3])
@@ -231,43 +229,36 @@ def _markers_of(bag: BagWriter, stamp: int, track: Mover) -> list[Any]:
         T[2, 3] = height / 2
     above = np.eye(4)
     above[:3, 3] = T[:3, 3] + (0.0, 0.0, height / 2 + _TEXT_GAP)
-    box = {"ns": "objects", "type": _CUBE, "size": (length, width, height), "color": _BOX_COLOR}
-    number = {"ns": "ids", "type": _TEXT, "size": (0.0, 0.0, _TEXT_HEIGHT), "color": _TEXT_COLOR}
-    return [
-        _make_marker(bag, stamp, {**box, "id": track.id}, T),
-        _make_marker(bag, stamp, {**number, "id": track.id, "text": str(track.id)}, above),
-    ]
+    box = _make_marker(stamp, T, (length, width, height), id=track.id)
+    number = _make_marker(
+        stamp,
+        above,
+        (0.0, 0.0, _TEXT_HEIGHT),
+        _TEXT_COLOR,
+        ns="ids",
+        type=_TEXT,
+        id=track.id,
+        text=str(track.id),
+    )
+    return [box, number]
 
 
-def _make_marker(bag: BagWriter, stamp: int, more: dict[str, Any], T: Float | None = None) -> Any:
-    """A Marker at a pose (4, 4) with `size`, `color` and other fields."""
-    x, y, z = more.pop("size", (1.0, 1.0, 1.0))
-    r, g, b, a = more.pop("color", _BOX_COLOR)
-    fields = {
-        "header": bag.header(stamp, MAP),
+def _make_marker(
+    stamp: int,
+    T: Float | None = None,
+    size: tuple[float, ...] = (1.0, 1.0, 1.0),
+    color: tuple[float, ...] = _BOX_COLOR,
+    **more: Any,
+) -> Fields:
+    """A Marker at a pose (4, 4), a box unless other fields say otherwise."""
+    header = ros.make_header(stamp, MAP)
+    return {
+        "header": header,
         "ns": "objects",
-        "id": 0,
         "type": _CUBE,
-        "action": _ADD,
-        "pose": ros.make_pose(bag, np.eye(4) if T is None else T),
-        "scale": bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        "color": bag.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
-        "lifetime": bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        "frame_locked": False,
-        "points": [],
-        "colors": [],
-        "text": "",
-        "mesh_resource": "",
-        "mesh_use_embedded_materials": False,
+        "pose": ros.make_pose(np.eye(4) if T is None else T),
+        "scale": dict(zip("xyz", size, strict=True)),
+        "color": dict(zip("rgba", color, strict=True)),
+        "texture": {"header": {"stamp": header["stamp"]}},  # of ROS 2
+        **more,
     }
-    if not bag.is_ros1:
-        empty = np.empty(0, np.uint8)
-        image = {"header": bag.header(stamp, ""), "format": "", "data": empty}
-        mesh = {"filename": "", "data": empty}
-        fields |= {
-            "texture_resource": "",
-            "texture": bag.make("sensor_msgs/msg/CompressedImage", **image),
-            "uv_coordinates": [],
-            "mesh_file": bag.make("visualization_msgs/msg/MeshFile", **mesh),
-        }
-    return bag.make("visualization_msgs/msg/Marker", **(fields | more))
