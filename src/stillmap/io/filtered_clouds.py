@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, atomic_folder
 from stillmap.core.input_files import InputFile, copy_file
-from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error
+from stillmap.io.filter_writers import FilterJob, Mask, Omissions, other_recording_error
 from stillmap.io.point_cloud import kitti, las, pcd, ply, table
 from stillmap.io.point_cloud.clouds import files_of
 from stillmap.io.point_cloud.table import TableLayout
+from stillmap.io.text_lines import replace_words
 
 _BLOCK_BYTES = 8 << 20  # of points copied at once
-_WORD = re.compile(rb"\S+")
 _LABEL = 4  # bytes of a label of SemanticKITTI
 
 # (file, its new copy, (n,) points to remove)
@@ -40,7 +40,7 @@ def write_kitti(job: FilterJob) -> Omissions:
     """
 
     def filter_file(path: Path, new: Path, mask: Mask) -> None:
-        _copy_table(kitti.scan_layout(path), new, mask, bytes)
+        _copy_table(kitti.scan_layout(path), new, mask)
         labels = job.source / "labels" / f"{path.stem}.label"
         if labels.is_file() and labels.stat().st_size == _LABEL * len(mask):
             folder = new.parents[len(path.relative_to(job.source).parts) - 1]
@@ -54,31 +54,20 @@ def write_kitti(job: FilterJob) -> Omissions:
 def write_pcd(job: FilterJob) -> Omissions:
     """Copy a PCD file or folder; points of organised clouds become NaN, others are removed."""
 
-    def read_layout(path: Path) -> TableLayout:
-        return pcd.read_header(path).layout
+    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+        _copy_table(pcd.read_header(path).layout, new, mask, rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+")
 
-    return _write_tables(job, pcd.EXTENSIONS, read_layout, {b"WIDTH": 1, b"POINTS": 1})
+    return _write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
 
 
 def write_ply(job: FilterJob) -> Omissions:
     """Copy a PLY file or folder; vertices are removed, or become NaN where other elements, such as
     faces, may refer to them by their number."""
-    return _write_tables(job, ply.EXTENSIONS, ply.read_layout, {b"element vertex": 2})
-
-
-def _write_tables(
-    job: FilterJob,
-    extensions: tuple[str, ...],
-    read_layout: Callable[[Path], TableLayout],
-    counts: dict[bytes, int],
-) -> Omissions:
-    """Copy a file or folder of tables; `counts`: see `_edit_counts`."""
 
     def filter_file(path: Path, new: Path, mask: Mask) -> None:
-        layout = read_layout(path)
-        _copy_table(layout, new, mask, _edit_counts(layout, mask, counts))
+        _copy_table(ply.read_layout(path), new, mask, rb"(?m)^(\s*element\s+vertex\s+)\d+")
 
-    return _write_files(job, files_of(job.source, extensions), filter_file)
+    return _write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
 
 
 def write_las(job: FilterJob) -> Omissions:
@@ -172,33 +161,7 @@ def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:
                 writer.write_evlrs(reader.evlrs)
 
 
-EditLine = Callable[[bytes], bytes]
-
-
-def _edit_counts(layout: TableLayout, mask: Mask, words: dict[bytes, int]) -> EditLine:
-    """Sets the count of points in lines of a header that begin so, at the word of this index."""
-    count = len(mask) - int(np.count_nonzero(mask))
-
-    def edit(line: bytes) -> bytes:
-        for begin, word in words.items():
-            if line.split()[: begin.count(b" ") + 1] == begin.split():
-                return _replace_words(line, {word: count})
-        return line
-
-    return bytes if layout.ordered else edit
-
-
-def _replace_words(line: bytes, values: dict[int, Any]) -> bytes:
-    """A line with the words of some indices replaced; all else stays."""
-    words, parts, at = list(_WORD.finditer(line)), [], 0
-    for index in sorted(values):
-        begin, end = words[index].span()
-        parts += [line[at:begin], str(values[index]).encode("ascii")]
-        at = end
-    return b"".join([*parts, line[at:]])
-
-
-def _copy_table(layout: TableLayout, new: Path, mask: Mask, edit_line: EditLine) -> None:
+def _copy_table(layout: TableLayout, new: Path, mask: Mask, counts: bytes = b"()") -> None:
     """Copy a file without the points of a mask; where they are ordered, they stay without
     coordinates: NaN, or 0 in columns of integers.
 
@@ -206,7 +169,7 @@ def _copy_table(layout: TableLayout, new: Path, mask: Mask, edit_line: EditLine)
         layout: of the file.
         new: its copy.
         mask: (n,) points to remove.
-        edit_line: changes counts in a line of the header.
+        counts: pattern of the lines of the header with the number of points after group 1.
 
     Raises:
         InputError: the file has another number of points, or is damaged.
@@ -217,7 +180,9 @@ def _copy_table(layout: TableLayout, new: Path, mask: Mask, edit_line: EditLine)
     copy = _copy_columns if layout.compressed else copy
     with InputFile(layout.path) as source, new.open("wb") as target:
         header = source.read(layout.header)
-        target.write(b"".join(edit_line(line) for line in header.splitlines(keepends=True)))
+        if header and not layout.ordered:
+            header = re.sub(counts, rb"\g<1>%d" % np.count_nonzero(~mask), header)
+        target.write(header)
         copy(source, target, layout, mask)
         shutil.copyfileobj(source, target)
 
@@ -267,7 +232,8 @@ def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask:
     header_lines, row = source.read(layout.header).count(b"\n"), 0
     for _ in range(layout.lines - header_lines):
         target.write(source.readline())
-    unknown = {value: _unknown(field.dtype) for field, _, value in map(layout.find_column, "xyz")}
+    columns = map(layout.find_column, "xyz")
+    unknown = {value: b"%g" % _unknown(field.dtype) for field, _, value in columns}
     while row < len(mask):
         line = source.readline()
         if not line:
@@ -278,5 +244,5 @@ def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask:
         if not mask[row]:
             target.write(line)
         elif layout.ordered:
-            target.write(_replace_words(line, unknown))
+            target.write(replace_words(line, unknown))
         row += 1

@@ -79,7 +79,7 @@ def _of_folder(is_one: Callable[[Path], bool]) -> Callable[[Path, bytes | None],
     return lambda path, start: start is None and is_one(path)
 
 
-def _load(module: str, function: str = "read") -> Any:
+def load_later(module: str, function: str = "read") -> Any:
     """A function of a module of this room, which is loaded when it is called."""
     return lambda *args: getattr(import_module(f"stillmap.io.{module}"), function)(*args)
 
@@ -104,7 +104,13 @@ FORMATS = (
     Format(
         "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
-    Format("ROS bag", messages.ENDINGS, messages.is_bag, _load(_ROS), _load(_ROS, "read_parts")),
+    Format(
+        "ROS bag",
+        messages.ENDINGS,
+        messages.is_bag,
+        load_later(_ROS),
+        load_later(_ROS, "read_parts"),
+    ),
     Format(
         "KITTI folder",
         ("velodyne/", "velodyne_points/"),
@@ -122,7 +128,7 @@ FORMATS = (
     _point_cloud_format("E57", e57.EXTENSIONS, e57.read, e57.is_e57),
     _point_cloud_format("LAS", las.EXTENSIONS, las.read, las.is_las),
     _point_cloud_format("PLY", ply.EXTENSIONS, ply.read, ply.is_ply),
-    Format("CARMEN log", _LOGS, _is_carmen, _load(_CARMEN), _load(_CARMEN, "read_parts")),
+    Format("CARMEN log", _LOGS, _is_carmen, load_later(_CARMEN), load_later(_CARMEN, "read_parts")),
 )
 
 

@@ -1,10 +1,12 @@
 """Reads numbered lines of a text file, plain or gzip, damaged or not."""
 
 import gzip
+import re
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -120,3 +122,9 @@ def _skip_rest(stream: IO[bytes] | gzip.GzipFile, limit: int) -> int:
         if rest.endswith(b"\n"):
             break
     return skipped
+
+
+def replace_words(line: bytes, words: Mapping[int, bytes]) -> bytes:
+    """A line with the words of some numbers, from 0, replaced; all else stays."""
+    number = count()
+    return re.sub(rb"\S+", lambda found: words.get(next(number), found[0]), line)

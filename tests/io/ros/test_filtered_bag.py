@@ -6,7 +6,7 @@ from rosbags.highlevel import AnyReader
 from small_bags import FLOAT, UINT16, UINT32, cloud_message, write_bag
 
 from stillmap.io import read
-from stillmap.io.filtered_copy import FilterJob, Omissions
+from stillmap.io.filter_writers import FilterJob, Omissions
 from stillmap.io.ros.filtered import write_filtered
 from stillmap.io.ros.messages import load_typestore
 from stillmap.prepare.options import ReadOptions

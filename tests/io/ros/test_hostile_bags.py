@@ -16,7 +16,7 @@ from stillmap.io import read
 from stillmap.io.builder import ReadContext
 from stillmap.io.ros import limits
 from stillmap.io.ros.messages import Channel, Message
-from stillmap.io.ros.reader import TopicSelection, collect_messages
+from stillmap.io.ros.reader import collect_messages
 from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
@@ -187,6 +187,5 @@ def test_messages_of_a_topic_that_nobody_wanted():
             assert topics == {"/scan"}
             yield Message(transforms, START, b"")
 
-    selection = TopicSelection({"/scan": "scans"}, False, [])
-    content = collect_messages(Damaged(), selection, ReadContext(ReadOptions()))
+    content = collect_messages(Damaged(), {"/scan": "scans"}, ReadContext(ReadOptions()))
     assert content.unreadable.total == 1

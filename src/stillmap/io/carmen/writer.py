@@ -1,7 +1,6 @@
 """Writes 2D recordings as CARMEN logs, and logs again with some beams blanked."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,8 @@ from stillmap.io.carmen.log import (
     read_log,
 )
 from stillmap.io.carmen.reader import LaserLines, is_stated_by_lines, select_scans
-from stillmap.io.filtered_copy import FilterJob, Omissions, other_recording_error
-from stillmap.io.text_lines import read_lines, write_atomically
+from stillmap.io.filter_writers import FilterJob, Omissions, other_recording_error
+from stillmap.io.text_lines import read_lines, replace_words, write_atomically
 from stillmap.prepare.max_range import MIN_ZERO_SHARE, find_max_range
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.prepare.time_window import TimeWindow
@@ -45,7 +44,6 @@ _MIN_CODE = 81.82  # m: from here on a FLASER reading means "no return"
 _SAME_ANGLE = 1e-5  # rad
 _UNKNOWN_LASER = 99  # CARMEN's laser_type
 _OVERFLOW = 81.91  # m: a value that SICK lasers report for no return
-_FIELD = re.compile(rb"\S+")
 _ALTERNATIVE = "write a bag or a recording folder instead"
 
 
@@ -295,13 +293,5 @@ def _number_lines(job: FilterJob, lasers: list[LaserLines]) -> dict[int, int]:
 
 def _blank_readings(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
     """A scan line with the readings `blank` (n,) replaced by the code."""
-    if not blank.any():
-        return text
-    at = len(BYTE_ORDER_MARK) if text.startswith(BYTE_ORDER_MARK) else 0
-    fields, parts = list(_FIELD.finditer(text, at)), [text[:at]]
-    first = first_reading(fields[0].group())
-    for k in np.flatnonzero(blank).tolist():
-        begin, end = fields[first + k].span()
-        parts += [text[at:begin], code]
-        at = end
-    return b"".join([*parts, text[at:]])
+    first = first_reading(text.removeprefix(BYTE_ORDER_MARK).split(maxsplit=1)[0])
+    return replace_words(text, {first + k: code for k in np.flatnonzero(blank).tolist()})

@@ -143,12 +143,6 @@ class CloudCollector:
         self.number.append(number)
         return None
 
-    def by_points(self) -> list[int]:
-        """The sensors, most points first: other clouds are derived from these."""
-        names = list(self.sensors)
-        points = np.bincount(np.asarray(self.scans.sensor), np.asarray(self.scans.length))
-        return sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
-
     def forward_scans(self, sensor: int) -> NDArray[np.intp]:
         """The scans of a sensor with non-decreasing stamps; others are counted."""
         rows = np.flatnonzero(np.asarray(self.scans.sensor) == sensor)
@@ -173,26 +167,26 @@ def read_clouds(
     if not names:
         total = SkippedRecords().merge(*clouds.skipped.values())
         raise InputError(f"holds no usable cloud: {total.summary('message')}")
-    counts = np.bincount(np.asarray(clouds.scans.sensor), minlength=len(names)).tolist()
-    order = clouds.by_points()
-    named = options.topic is not None
-    chosen, omitted = tf.drop_duplicates([(*names[k], counts[k]) for k in order], named=named)
-    chosen = [order[k] for k in chosen]
+    stamps, sensor = np.asarray(clouds.scans.stamp_ns, np.int64), np.asarray(clouds.scans.sensor)
+    counts = np.bincount(sensor).tolist()
+    points = np.bincount(sensor, np.asarray(clouds.scans.length))
+    # most points first: other clouds are derived from these
+    order = sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
+    sensors = [tf.Sensor(*names[k], stamps[sensor == k]) for k in order]
+    poses = tf.place_sensors(frames, sensors, options)
+    chosen = [order[k] for k in poses.used]
     rows = [clouds.forward_scans(k) for k in chosen]
-    stamps = np.asarray(clouds.scans.stamp_ns, np.int64)
-    sensors = [tf.Sensor(*names[k], stamps[own]) for k, own in zip(chosen, rows, strict=True)]
-    poses = tf.place_sensors(frames, sensors, options, omitted)
     T, warnings = np.tile(np.eye(4), (len(names), 1, 1)), list(poses.warnings)
-    for k, of_scans in zip(poses.used, poses.T_base_sensor, strict=True):
-        T[chosen[k]] = of_scans[0]
+    for k, of_scans in zip(chosen, poses.T_base_sensor, strict=True):
+        T[k] = of_scans[0]
         if np.abs(of_scans - of_scans[0]).max() > _STILL:
             text = "the sensor moves on the robot: its first pose is used"
-            warnings.append(f"{sensors[k].topic}: {text}")
+            warnings.append(f"{names[k][0]}: {text}")
     odom, origin = tf.find_odometry(frames, poses.base, stamps, options, warnings)
     described = zip(names, counts, strict=True)
     recording = clouds.scans.build(
         T,
-        selection=np.sort(np.concatenate([rows[k] for k in poses.used])),
+        selection=np.concatenate(rows),
         T_odom_base=odom,
         images=find_images(poses.base),
         record=np.asarray(clouds.number, np.int64),
@@ -202,7 +196,7 @@ def read_clouds(
             base_frame_how=poses.how,
             odometry=origin,
             skipped=SkippedRecords().merge(*clouds.skipped.values()).by_reason(),
-            duplicates=omitted,
+            duplicates=poses.omitted,
             warnings=warnings,
         ),
     )

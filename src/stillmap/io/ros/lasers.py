@@ -75,20 +75,15 @@ class LaserScans:
     """The scans of one laser, by topic and frame.
 
     Attributes, once it is finished:
-        stamp_ns: (T,) int64, not decreasing.
+        raw: T scans with non-decreasing stamps.
         number: (T,) int64 number of the message on its topic, from 1.
-        start: (T,) int64 index of the first reading of each in `ranges`.
-        shape: (T,) int32 index into `shapes`.
-        shapes: distinct beam geometries.
-        ranges: (N,) float32 metres, of all scans; may be memory-mapped.
+        shape: that of most scans.
         warnings: sentences.
     """
 
-    stamp_ns: NDArray[np.int64]
+    raw: RawLaser
     number: NDArray[np.int64]
-    start: NDArray[np.int64]
-    shape: NDArray[np.int32]
-    ranges: NDArray[np.float32]
+    shape: ScanShape
 
     def __init__(self, topic: str, frame: str, scratch: Path | None) -> None:
         self.topic, self.frame = topic, frame
@@ -113,9 +108,9 @@ class LaserScans:
 
     def finish(self, skipped: SkippedRecords) -> None:
         """Keep the scans with non-decreasing stamps, without repeated ones; others are counted."""
-        ranges = self.ranges = self._ranges.finish()
+        ranges, shapes = self._ranges.finish(), list(self._shapes)
         stamps, log_ns, number, shape = np.asarray(self._rows, np.int64).reshape(-1, 4).T.copy()
-        n = np.array([s.n for s in self.shapes], np.int64)[shape]
+        n = np.array([s.n for s in shapes], np.int64)[shape]
         start = np.cumsum(n) - n
         if np.mean(stamps == 0) > 0.5:
             stamps = log_ns
@@ -130,48 +125,35 @@ class LaserScans:
             repeated[k] = np.array_equal(a, b, equal_nan=True)
         skipped.add_all(REPEATED, number[keep[repeated]])
         keep = keep[~repeated]
-        self.stamp_ns, self.number, self.start = stamps[keep], number[keep], start[keep]
-        self.shape = shape[keep].astype(np.int32)
-
-    @property
-    def shapes(self) -> list[ScanShape]:
-        return list(self._shapes)
-
-    @property
-    def n_scans(self) -> int:
-        return len(self.stamp_ns)
-
-    @property
-    def typical_shape(self) -> ScanShape:
-        """The shape of most scans."""
-        return self.shapes[int(np.bincount(self.shape, minlength=len(self.shapes)).argmax())]
-
-    def to_raw(self, upside_down: bool = False) -> RawLaser:
-        """The scans as they are interpreted; upside down, angles change their sign."""
-        sign = -1.0 if upside_down else 1.0
-        usual = self.typical_shape
-        return RawLaser(
+        self.number, usual = number[keep], shapes[int(np.bincount(shape[keep]).argmax())]
+        self.shape = usual
+        self.raw = RawLaser(
             self.topic,
-            self.stamp_ns,
-            self.ranges,
-            self.start,
-            self.shape,
-            [unit_vectors(sign * s.angles()).astype(np.float32) for s in self.shapes],
-            self._beam_steps(),
+            stamps[keep],
+            ranges,
+            start[keep],
+            shape[keep],
+            [unit_vectors(s.angles()).astype(np.float32) for s in shapes],
+            _beam_steps(stamps[keep], shapes),
             usual.range_min,
             usual.range_max if 0.0 < usual.range_max < MAX_PLAUSIBLE_RANGE else None,
         )
 
-    def _beam_steps(self) -> tuple[float, ...]:
-        """Seconds from beam to beam of each shape; 0 where missing or implausible."""
-        span = float(self.stamp_ns[-1] - self.stamp_ns[0]) / 1e9 if self.n_scans > 1 else 0.0
-        # 1 / rate, as it was always rounded
-        period = 1.0 / ((self.n_scans - 1) / span) if span > 0.0 else _MAX_SCAN_TIME
-        steps = np.array([s.time_increment for s in self.shapes])
-        duration = np.abs(steps) * np.array([max(s.n - 1, 1) for s in self.shapes])
-        # many drivers leave the field unset or wrong
-        plausible = np.isfinite(steps) & (duration <= min(_MAX_SCAN_TIME, 1.5 * period))
-        return tuple(np.where(plausible, steps, 0.0).tolist())
+    @property
+    def n_scans(self) -> int:
+        return len(self.number)
+
+
+def _beam_steps(stamps: NDArray[np.int64], shapes: list[ScanShape]) -> tuple[float, ...]:
+    """Seconds from beam to beam of each shape; 0 where missing or implausible."""
+    span = float(stamps[-1] - stamps[0]) / 1e9
+    # 1 / rate, as it was always rounded
+    period = 1.0 / ((len(stamps) - 1) / span) if span > 0.0 else _MAX_SCAN_TIME
+    steps = np.array([s.time_increment for s in shapes])
+    duration = np.abs(steps) * np.array([max(s.n - 1, 1) for s in shapes])
+    # many drivers leave the field unset or wrong
+    plausible = np.isfinite(steps) & (duration <= min(_MAX_SCAN_TIME, 1.5 * period))
+    return tuple(np.where(plausible, steps, 0.0).tolist())
 
 
 class LaserCollector:
@@ -193,18 +175,18 @@ class LaserCollector:
         return fault
 
     def finish(self) -> list[LaserScans]:
-        """The lasers with at least one usable scan: most scans first, then most beams.
+        """The lasers: most scans first, then most beams.
 
         Raises:
-            InputError: there is none.
+            InputError: there is none with a usable scan.
         """
-        for laser in self._lasers.values():
-            laser.finish(self.skipped[laser.topic])
-        usable = [laser for laser in self._lasers.values() if laser.n_scans]
-        if not usable:
+        if not self._lasers:
             total = SkippedRecords().merge(*self.skipped.values())
             raise InputError(f"holds no usable laser scan: {total.summary('message')}")
-        return sorted(usable, key=lambda s: (-s.n_scans, -s.shapes[s.shape[0]].n, s.topic))
+        for laser in self._lasers.values():
+            laser.finish(self.skipped[laser.topic])
+        first_first = {s: -len(s.raw.directions[s.raw.shape[0]]) for s in self._lasers.values()}
+        return sorted(first_first, key=lambda s: (-s.n_scans, first_first[s], s.topic))
 
 
 def _first_echoes(scan: Any) -> NDArray[np.float32]:
@@ -212,50 +194,47 @@ def _first_echoes(scan: Any) -> NDArray[np.float32]:
     return np.array([e.echoes[0] if len(e.echoes) else np.nan for e in scan.ranges], np.float32)
 
 
-def _select_lasers(
-    collector: LaserCollector, frames: tf.Frames, options: ReadOptions
-) -> tuple[list[LaserScans], tf.SensorPoses, list[str]]:
-    """The lasers whose pose on the robot is known, their poses, and sentences on the others."""
-    scans = collector.finish()
-    named = options.topic is not None
-    order, omitted = tf.drop_duplicates([(s.topic, s.frame, s.n_scans) for s in scans], named=named)
-    sensors = [tf.Sensor(scans[k].topic, scans[k].frame, scans[k].stamp_ns) for k in order]
-    poses = tf.place_sensors(frames, sensors, options, omitted)
-    return [scans[order[k]] for k in poses.used], poses, omitted
-
-
-def read_lasers(collector: LaserCollector, frames: tf.Frames, context: ReadContext) -> RawLasers:
-    """The 2D scans of all lasers.
+def read_lasers(
+    collector: LaserCollector, frames: tf.Frames, context: ReadContext, *, tilting: bool = False
+) -> RawLasers:
+    """The 2D scans of all lasers, or those of a laser that tilts, to become a 3D recording.
 
     Raises:
         InputError: no scan can be used, or options do not fit the lasers.
     """
-    options = context.options
-    used, poses, omitted = _select_lasers(collector, frames, options)
-    options.check_laser_count(len(used))
-    warnings = [w for s in used for w in s.warnings] + poses.warnings
-    raw, mounts, sensors = [], [], []
-    for number, scans in enumerate(used):
-        mount, notes = _find_mount(scans, poses, number, options, warnings)
-        raw.append(scans.to_raw(bool(notes.upside_down)))
-        mounts.append(mount)
-        sensors.append(notes)
-    order = scan_order(raw)
-    stamps = np.concatenate([s.stamp_ns for s in used])[order]
-    odom, origin = tf.find_odometry(frames, poses.base, stamps, options, warnings)
+    scans, options = collector.finish(), context.options
+    sensors = [tf.Sensor(s.topic, s.frame, s.raw.stamp_ns) for s in scans]
+    poses = tf.place_sensors(frames, sensors, options)
+    used = [scans[k] for k in poses.used]
     skipped = SkippedRecords().merge(*(collector.skipped[t] for t in {s.topic for s in used}))
-    warnings += skipped.loss_warnings(sum(s.n_scans for s in used), "message")
+    losses = skipped.loss_warnings(sum(s.n_scans for s in used), "message")
+    warnings = [w for s in used for w in s.warnings]
     source = Source(
-        sensors=sensors,
         base_frame=poses.base,
         base_frame_how=poses.how,
-        odometry=origin,
         skipped=skipped.by_reason(),
-        duplicates=omitted,
         warnings=warnings,
     )
+    if tilting:
+        warnings += losses
+        return _read_tilting_laser(used, poses, frames.tree, source, context.scratch)
+    options.check_laser_count(len(used))
+    warnings += poses.warnings
+    raw, mounts = [], []
+    for number, laser in enumerate(used):
+        mount, notes = _find_mount(laser, poses, number, options, warnings)
+        sign = -1.0 if notes.upside_down else 1.0
+        mirrored = [d * np.array([1.0, sign], np.float32) for d in laser.raw.directions]
+        raw.append(replace(laser.raw, directions=mirrored))
+        mounts.append(mount)
+        source.sensors.append(notes)
+    at = scan_order(raw)
+    stamps = np.concatenate([laser.stamp_ns for laser in raw])[at]
+    odom, source.odometry = tf.find_odometry(frames, poses.base, stamps, options, warnings)
+    warnings += losses
+    source.duplicates = poses.omitted
     T_odom_base = None if odom is None else tf.project_to_plane(odom)[0]
-    record = np.concatenate([s.number for s in used])[order]
+    record = np.concatenate([s.number for s in used])[at]
     return RawLasers(raw, mounts, T_odom_base, source, record)
 
 
@@ -278,23 +257,27 @@ def _find_mount(
         flat = pose.matrix()[None]
     if given.upside_down is not None:
         upside_down, upside_down_how = given.upside_down, "given"
-    shape, sign = scans.typical_shape, -1.0 if upside_down else 1.0
+    sign = -1.0 if upside_down else 1.0
     return flat, SensorNotes(
         scans.topic,
         scans.frame,
         scans.n_scans,
         len(flat),
-        shape.n,
-        sign * shape.angle_min,
-        sign * shape.angle_increment,
+        scans.shape.n,
+        sign * scans.shape.angle_min,
+        sign * scans.shape.angle_increment,
         upside_down,
         upside_down_how,
         extrinsics=pose,
     )
 
 
-def read_tilting_laser(
-    collector: LaserCollector, frames: tf.Frames, context: ReadContext
+def _read_tilting_laser(
+    used: list[LaserScans],
+    poses: tf.SensorPoses,
+    tree: tf.TransformTree,
+    source: Source,
+    scratch: Path | None,
 ) -> RawLasers:
     """The scans of a laser that tilts or pans, to become a 3D recording.
 
@@ -304,7 +287,6 @@ def read_tilting_laser(
     Raises:
         InputError: there are several lasers, or this one does not move on the robot.
     """
-    used, poses, _ = _select_lasers(collector, frames, context.options)
     scans, T_base_sensor = used[0], poses.T_base_sensor[0]
     if len(used) > 1:
         raise InputError(f"{scans.topic}: scans of several lasers: only one can tilt")
@@ -313,17 +295,10 @@ def read_tilting_laser(
         hint = "transforms must say how the joint moves, as robot_state_publisher does"
         what = f"{scans.topic}: {scans.frame!r} does not tilt in {poses.base!r}"
         raise InputError(what, hint=hint)
-    skipped = collector.skipped[scans.topic]
-    notes = SensorNotes(scans.topic, scans.frame, scans.n_scans, places=scans.n_scans)
-    source = Source(
-        sensors=[notes],
-        base_frame=poses.base,
-        base_frame_how=poses.how,
-        skipped=skipped.by_reason(),
-        warnings=scans.warnings + skipped.loss_warnings(scans.n_scans, "message"),
-    )
-    to_3d = partial(_convert_to_3d, frames.tree, poses.base, scans, T_base_sensor, context.scratch)
-    return RawLasers([scans.to_raw()], [T_base_sensor], None, source, to_3d=to_3d)
+    n = scans.n_scans
+    source.sensors.append(SensorNotes(scans.topic, scans.frame, n, places=n))
+    to_3d = partial(_convert_to_3d, tree, poses.base, scans, T_base_sensor, scratch)
+    return RawLasers([scans.raw], [T_base_sensor], None, source, to_3d=to_3d)
 
 
 def _convert_to_3d(
@@ -340,7 +315,7 @@ def _convert_to_3d(
     for first in range(0, M, _BLOCK):
         block = slice(first, min(first + _BLOCK, M))
         scan = np.searchsorted(beams.offset, np.arange(block.start, block.stop), side="right") - 1
-        at_ns = scans.stamp_ns[scan]
+        at_ns = scans.raw.stamp_ns[scan]
         if beams.beam_time is not None:
             after_ns = np.round(1e9 * beams.beam_time[block].astype(np.float64))
             at_ns = at_ns + after_ns.astype(np.int64)

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros.bag import bag_size, open_bag
 from stillmap.io.ros.clouds import CloudCollector, read_clouds
 from stillmap.io.ros.image import ImageCollector
-from stillmap.io.ros.lasers import LaserCollector, read_lasers, read_tilting_laser
+from stillmap.io.ros.lasers import LaserCollector, read_lasers
 from stillmap.io.ros.limits import count_output, limit_output
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
@@ -103,27 +102,24 @@ def _read_bag(
     tilting: bool,
 ) -> Recording | RawLasers:
     topics = select_topics(bag, context.options)
-    content = collect_messages(bag, topics, context)
+    content = collect_messages(bag, topics.uses, context)
+    tree, window = content.transforms, content.window
     if others and not _static_topics(bag):
-        _lend_transforms(content.transforms, others, context.scratch)
-    frames = Frames(content.transforms, content.odometry)
+        _lend_transforms(tree, others, context.scratch)
+    frames = Frames(tree, [own for own in content.odometry.values() if len(own.stamp_ns)])
+    recording: Recording | RawLasers
     if topics.has_clouds:
 
         def find_images(base: str) -> Images | None:
-            images = content.images.build_images(content.transforms, base, reopen)
-            return content.window.select_images(images)
+            return window.select_images(content.images.build_images(tree, base, reopen))
 
-        recording: Recording | RawLasers = read_clouds(
-            content.clouds, frames, context.options, find_images
-        )
+        recording = read_clouds(content.clouds, frames, context.options, find_images)
     else:
-        read_scans = read_tilting_laser if tilting else read_lasers
-        recording = read_scans(content.lasers, frames, context)
-    source = recording.source
+        recording = read_lasers(content.lasers, frames, context, tilting=tilting)
+    source, of_odometry = recording.source, [own.skipped for own in content.odometry.values()]
     source.topics, source.skipped_unit = topics.notes, "message"
-    source.damage = bag.damage.by_reason()
-    source.skipped_odometry = content.skipped_odometry.by_reason()
-    source.part = content.window.part
+    source.damage, source.part = bag.damage.by_reason(), window.part
+    source.skipped_odometry = content.unreadable.merge(tree.skipped, *of_odometry).by_reason()
     return recording
 
 
@@ -164,36 +160,48 @@ def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
     Raises:
         InputError: no topic has scans, or a topic that the options name has none.
     """
-    usable = [c for c in bag.channels if c.n_messages and find_fault(c) is None]
+    faults = {c.id: fault for c in bag.channels if (fault := find_fault(c))}
+    faults |= {c.id: "is empty" for c in bag.channels if not c.n_messages}
+    of_scans = [c for c in bag.channels if c.type in SCAN_TYPES]
     tilting = {f"{slash}{options.tilting_topic}" for slash in ("", "/")}
-    scans = _find_named(usable, bag, options) or [c for c in usable if c.type in SCAN_TYPES]
+    scans = _find_named(bag, faults, options) or [c for c in of_scans if c.id not in faults]
     scans = [c for c in scans if c.topic not in tilting]
     if not scans:
-        of_scans = [c for c in bag.channels if c.type in SCAN_TYPES]
-        faults = [f"{c.topic} {fault}" for c in of_scans if (fault := find_fault(c))]
-        faults += [f"{c.topic} is empty" for c in of_scans if not c.n_messages]
-        what = f"holds no scans: {faults[0]}" if faults else "holds no scans"
-        raise InputError(what, hint=_list_topics(bag.channels))
+        named = [f": {c.topic} {faults[c.id]}" for c in of_scans if c.id in faults]
+        raise InputError("holds no scans" + "".join(named[:1]), hint=_list_topics(bag.channels))
     lasers = [c for c in scans if c.type != POINT_CLOUD]
     further = {"odometry": (ODOMETRY,), "transforms": (TF, ROS1_TF)}
     if not lasers:
         further["images"] = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
+    usable = [c for c in bag.channels if c.id not in faults]
     uses = {c.topic: use for use, types in further.items() for c in usable if c.type in types}
     uses |= dict.fromkeys((c.topic for c in lasers or scans), "scans")
-    notes = [_describe_topic(c, uses.get(c.topic), tilting) for c in bag.channels]
+    notes = []
+    for c in bag.channels:
+        use = uses.get(c.topic)
+        why = faults.get(c.id, "not used: others are (read.topic names it)")
+        if c.n_messages == 0:
+            why = "empty"
+        elif use is not None:
+            why = f"read for {use}"
+        elif c.type not in (*SCAN_TYPES, ODOMETRY, TF, ROS1_TF):
+            why = "not used"
+        elif c.topic in tilting:
+            why = "not for the map: its laser tilts"
+        note = {"topic": c.topic, "type": c.type, "messages": c.n_messages}
+        notes.append({**note, "used": use is not None, "why": why})
     return TopicSelection(uses, not lasers, notes)
 
 
-def _find_named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channel]:
+def _find_named(bag: Bag, faults: dict[int, str], options: ReadOptions) -> list[Channel]:
     """The channels of the topics that the options name."""
     named = []
-    for name in (options.topic or "").split(",") if options.topic is not None else ():
+    for name in options.topic.split(",") if options.topic is not None else ():
         own = [c for c in bag.channels if c.topic in (name.strip(), f"/{name.strip()}")]
-        scans = [c for c in own if c in usable and c.type in SCAN_TYPES]
+        scans = [c for c in own if c.type in SCAN_TYPES and c.id not in faults]
         if not scans:
-            faults = [find_fault(c) or f"has {c.type}, no scans" for c in own if c.n_messages]
-            fault = faults[0] if faults else ("is empty" if own else "is not there")
-            raise InputError(f"topic {name.strip()!r} {fault}", hint=_list_topics(bag.channels))
+            why = [faults.get(c.id, f"has {c.type}, no scans") for c in own] or ["is not there"]
+            raise InputError(f"topic {name.strip()!r} {why[0]}", hint=_list_topics(bag.channels))
         named += scans
     if len({c.type == POINT_CLOUD for c in named}) > 1:
         raise InputError("laser scans and point clouds cannot be used together", hint="name either")
@@ -208,113 +216,74 @@ def _list_topics(channels: list[Channel]) -> str:
     return f"{'topics with scans:' if of_scans else 'it has'} {', '.join(shown)}"
 
 
-def _describe_topic(channel: Channel, use: str | None, tilting: set[str]) -> dict[str, Any]:
-    if channel.n_messages == 0:
-        why = "empty"
-    elif use is not None:
-        why = f"read for {use}"
-    elif channel.type not in (*SCAN_TYPES, ODOMETRY, TF, ROS1_TF):
-        why = "not used"
-    elif channel.topic in tilting:
-        why = "not for the map: its laser tilts"
-    else:
-        why = find_fault(channel) or "not used: others are (read.topic names it)"
-    return {
-        "topic": channel.topic,
-        "type": channel.type,
-        "messages": channel.n_messages,
-        "used": use is not None,
-        "why": why,
-    }
-
-
-@dataclass
 class BagContent:
-    """The content of the selected topics."""
+    """The content of the selected topics, whose `uses` are as in `TopicSelection`."""
 
-    lasers: LaserCollector
-    clouds: CloudCollector
-    window: TimeWindow
-    skipped: SkippedByTopic
-    count: Counter[str] = field(default_factory=Counter)  # scans by topic
-    images: ImageCollector = field(default_factory=ImageCollector)
-    transforms: TransformTree = field(default_factory=TransformTree)
-    odometry_by_topic: dict[str, Odometry] = field(default_factory=dict)
-    unreadable: SkippedRecords = field(default_factory=SkippedRecords)
+    def __init__(self, uses: dict[str, str], context: ReadContext) -> None:
+        self._uses, self._count = uses, Counter[str]()  # scans by topic
+        self.window = TimeWindow(context.options)
+        self.skipped = SkippedByTopic(SkippedRecords)
+        self.lasers = LaserCollector(context.scratch, self.skipped)
+        self.clouds = CloudCollector(context.scratch, self.skipped)
+        self.images, self.transforms = ImageCollector(), TransformTree()
+        self.odometry: dict[str, Odometry] = {}
+        self.unreadable = SkippedRecords()
 
-    @property
-    def odometry(self) -> list[Odometry]:
-        """The Odometry topics with at least one pose."""
-        return [topic for topic in self.odometry_by_topic.values() if len(topic.stamp_ns)]
-
-    @property
-    def skipped_odometry(self) -> SkippedRecords:
-        """Transforms and poses that could not be used."""
-        of_topics = (topic.skipped for topic in self.odometry_by_topic.values())
-        return self.unreadable.merge(self.transforms.skipped, *of_topics)
-
-    def add(self, message: Message, use: str | None, number: int) -> None:
+    def add(self, message: Message, number: int) -> None:
         """Add a message; scans and images outside the time window are not decoded."""
         topic = message.channel.topic
-        if use == "scans":
-            self.count[topic] += 1
-            stamp = peek_stamp_ns(message) if self.window else None
-            if stamp is None or self.window.select(stamp):
-                self._add_scan(message)
-        elif use == "images":
-            # one CameraInfo holds for all images
-            whole = not self.window or message.channel.type == CAMERA_INFO
-            stamp = None if whole else peek_stamp_ns(message)
-            if stamp is None or self.window.contains(stamp):
-                self.images.add_message(message)
-        else:
-            try:
-                self._add_pose(message, use)
-            except Exception:  # any error of rosbags about damaged bytes
-                self.unreadable.add(f"{UNREADABLE} ({topic})", number)
-
-    def _add_scan(self, message: Message) -> None:
-        topic = message.channel.topic
-        scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
+        use = self._uses.get(topic)
+        self._count[topic] += use == "scans"
+        if not self._is_selected(message, use):
+            return
         try:
-            fault = scans.add(message, self.count[topic])
+            fault = self._collect(message, use)
         except OSError:  # the disk is full
             raise
         except Exception:  # any error of rosbags about damaged bytes
             fault = UNREADABLE
-        if fault is not None:
-            self.skipped[topic].add(fault, self.count[topic])
+        if fault is not None and use == "scans":
+            self.skipped[topic].add(fault, self._count[topic])
+        elif fault is not None:
+            self.unreadable.add(f"{fault} ({topic})", number)
 
-    def _add_pose(self, message: Message, use: str | None) -> None:
+    def _is_selected(self, message: Message, use: str | None) -> bool:
+        # one CameraInfo holds for all images
+        timed = use in ("scans", "images") and message.channel.type != CAMERA_INFO
+        stamp = peek_stamp_ns(message) if timed and self.window else None
+        select = self.window.select if use == "scans" else self.window.contains
+        return stamp is None or select(stamp)
+
+    def _collect(self, message: Message, use: str | None) -> str | None:
+        """Add a message to those of its use; returns the reason if it cannot be used."""
         topic = message.channel.topic
-        if use == "transforms":
-            static = topic.endswith(_STATIC)
-            self.transforms.add_message(decode(message), static=static)
+        if use == "scans":
+            scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
+            return scans.add(message, self._count[topic])
+        if use == "images":
+            self.images.add_message(message)
+        elif use == "transforms":
+            self.transforms.add_message(decode(message), static=topic.endswith(_STATIC))
         elif use == "odometry":
-            odometry = self.odometry_by_topic.setdefault(topic, Odometry(topic))
-            odometry.add_message(decode(message))
+            self.odometry.setdefault(topic, Odometry(topic)).add_message(decode(message))
         else:  # of a damaged bag whose connections have the number of others
-            raise ValueError(topic)
+            return UNREADABLE
+        return None
 
 
-def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) -> BagContent:
-    """Read the selected topics.
+def collect_messages(bag: Bag, uses: dict[str, str], context: ReadContext) -> BagContent:
+    """Read the topics that have a use.
 
     Raises:
         DamagedBagError: an indexed bag is damaged.
         InputError: no scan lies in the window.
     """
-    window, skipped = TimeWindow(context.options), SkippedByTopic(SkippedRecords)
-    collectors = (
-        LaserCollector(context.scratch, skipped),
-        CloudCollector(context.scratch, skipped),
-    )
-    content = BagContent(*collectors, window, skipped)
-    total = sum(c.n_messages for c in bag.channels if c.topic in selection.uses)
-    for number, message in enumerate(bag.messages(set(selection.uses)), start=1):
+    content = BagContent(uses, context)
+    total = sum(c.n_messages for c in bag.channels if c.topic in uses)
+    for number, message in enumerate(bag.messages(set(uses)), start=1):
         count_output(len(message.raw))
-        content.add(message, selection.uses.get(message.channel.topic), number)
+        content.add(message, number)
         if context.progress is not None and number % _PROGRESS_INTERVAL == 0:
             context.progress(min(number / max(total, 1), 1.0))
-    window.require_scans()
+    content.window.require_scans()
     return content

@@ -55,13 +55,11 @@ class _Edge:
     def sorted_by_time(self) -> "_Edge":
         """Without duplicate stamps (the last one counts); constant if all values are equal."""
         stamps, values = np.asarray(self.stamp_ns, np.int64), np.asarray(self.values).reshape(-1, 7)
-        order = np.argsort(stamps, kind="stable")
-        stamps, values = stamps[order], values[order]
-        last = np.append(stamps[1:] != stamps[:-1], True)
+        last = len(stamps) - 1 - np.unique(stamps[::-1], return_index=True)[1]
         out = _Edge(self.parent)
         out.stamp_ns = array("q", stamps[last].tolist())
         out.values = array("d", values[last].ravel())
-        out.constant = self.constant or bool(np.all(values == values[0]))
+        out.constant = self.constant or bool(np.all(values == values[last[0]]))
         return out
 
     def interpolate(self, at_ns: Stamps) -> tuple[Float, int]:
@@ -95,18 +93,17 @@ class TransformTree:
 
     def add_message(self, message: Any, *, static: bool) -> None:
         """Add the transforms of a TFMessage."""
-        for transform in message.transforms:
-            t, q = transform.transform.translation, transform.transform.rotation
-            values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
-            parent = frame_name(transform.header.frame_id)
-            child = frame_name(transform.child_frame_id)
-            self.add_transform(parent, child, stamp_ns(transform.header), values, static=static)
+        for one in message.transforms:
+            parent, child = frame_name(one.header.frame_id), frame_name(one.child_frame_id)
+            t, q = one.transform.translation, one.transform.rotation
+            self.add_transform(parent, child, stamp_ns(one.header), t, q, static=static)
 
     def add_transform(
-        self, parent: str, child: str, stamp: int, values: tuple[float, ...], *, static: bool
+        self, parent: str, child: str, stamp: int, t: Any, q: Any, *, static: bool = False
     ) -> bool:
-        """Add a transform: x y z in metres and a quaternion x y z w; an invalid one is counted."""
+        """Add a transform: a translation in metres and a quaternion; an invalid one is counted."""
         self._number += 1
+        values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
         # each by itself: max() of several, NaN among them, may return any of them
         near = all(abs(value) < MAX_TRANSLATION for value in values[:3])
         is_pose = near and abs(math.hypot(*values[3:]) - 1.0) < _NORM_TOLERANCE
@@ -205,10 +202,8 @@ class Odometry:
 
     def add_message(self, message: Any) -> None:
         """Add the pose of a message; an invalid one is counted."""
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        stamp = stamp_ns(message.header)
-        if self._tree.add_transform("odometry", "robot", stamp, values, static=False):
+        pose, stamp = message.pose.pose, stamp_ns(message.header)
+        if self._tree.add_transform("odometry", "robot", stamp, pose.position, pose.orientation):
             self.frame = frame_name(message.header.frame_id)
             self.child = frame_name(message.child_frame_id)
             self.stamp_ns.append(stamp)
@@ -243,6 +238,7 @@ class SensorPoses(NamedTuple):
         how: how it was found.
         used: indices of the sensors that are used.
         T_base_sensor: of each of these (N, 4, 4) at its scans.
+        omitted: sentences on the others.
         warnings: sentences.
     """
 
@@ -250,23 +246,24 @@ class SensorPoses(NamedTuple):
     how: str
     used: list[int]
     T_base_sensor: list[Float]
+    omitted: list[str]
     warnings: list[str]
 
 
-def place_sensors(
-    frames: Frames, sensors: list[Sensor], options: ReadOptions, omitted: list[str]
-) -> SensorPoses:
+def place_sensors(frames: Frames, sensors: list[Sensor], options: ReadOptions) -> SensorPoses:
     """Find the base frame and the poses of sensors in it, which are in order of preference.
 
-    Sentences on those that are not connected with it are added to `omitted`.
+    Of topics in the same frame the first is used, and only those connected with the base.
 
     Raises:
         InputError: the options name a frame that is not there, or a topic that cannot be used.
     """
-    base, how = _find_base_frame(frames, [sensor.frame for sensor in sensors], options)
+    kept, omitted = _drop_duplicates(sensors, named=options.topic is not None)
+    base, how = _find_base_frame(frames, [sensors[k].frame for k in kept], options)
     used: list[int] = []
     T_base_sensor = []
-    for k, sensor in enumerate(sensors):
+    for k in kept:
+        sensor = sensors[k]
         pose = frames.tree.lookup(base, sensor.frame, sensor.stamp_ns)
         if pose is None and options.base_frame is not None and not used:
             raise InputError(f"no transform connects {sensor.frame!r} with {base!r}")
@@ -285,7 +282,26 @@ def place_sensors(
             others = " and ".join(sensors[k].topic for k in used)
             raise InputError(f"topic {topic!r} cannot be used with {others}: {why}")
     warning = f"no transform gives the pose of {base!r} on a robot: it is used as the base frame"
-    return SensorPoses(base, how, used, T_base_sensor, [warning] * (how == SENSOR_IS_BASE))
+    return SensorPoses(base, how, used, T_base_sensor, omitted, [warning] * (how == SENSOR_IS_BASE))
+
+
+def _drop_duplicates(sensors: list[Sensor], *, named: bool) -> tuple[list[int], list[str]]:
+    """Indices of one topic per frame, and sentences on the others.
+
+    Unless the user `named` the topics, those with few scans are dropped too.
+    """
+    most = max(len(sensor.stamp_ns) for sensor in sensors)
+    used: dict[str, int] = {}  # by frame
+    dropped = []
+    for k, (topic, frame, stamps) in enumerate(sensors):
+        scans = f"{topic}: {len(stamps)} scans"
+        if frame in used:
+            dropped.append(f"{scans}, {sensors[used[frame]].topic} shows the same sensor")
+        elif not named and len(stamps) < _MIN_SHARE * most:
+            dropped.append(f"{scans} are too few")
+        else:
+            used[frame] = k
+    return list(used.values()), dropped
 
 
 def _find_base_frame(frames: Frames, sensors: list[str], options: ReadOptions) -> tuple[str, str]:
@@ -310,31 +326,6 @@ def _find_base_frame(frames: Frames, sensors: list[str], options: ReadOptions) -
     if lowest is None and len(path) > 1:
         return path[-1], "all frames hang on it"
     return sensors[0], SENSOR_IS_BASE
-
-
-def drop_duplicates(
-    sensors: list[tuple[str, str, int]], *, named: bool
-) -> tuple[list[int], list[str]]:
-    """Keep one topic per sensor: of topics in the same frame the first.
-
-    Args:
-        sensors: topic, frame and number of scans, in order of preference.
-        named: the user named the topics; otherwise topics with few scans are dropped too.
-
-    Returns:
-        Indices of those to use, and sentences on the others.
-    """
-    most = max(n for _, _, n in sensors)
-    used: dict[str, int] = {}  # by frame
-    dropped = []
-    for k, (topic, frame, n) in enumerate(sensors):
-        if frame in used:
-            dropped.append(f"{topic}: {n} scans, {sensors[used[frame]][0]} shows the same sensor")
-        elif not named and n < _MIN_SHARE * most:
-            dropped.append(f"{topic}: {n} scans are too few")
-        else:
-            used[frame] = k
-    return list(used.values()), dropped
 
 
 def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
