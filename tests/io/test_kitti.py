@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.scan_files import assign_rows, read_times
+from stillmap.io.text_lines import assign_rows, read_times
 
 # the laser's x is the camera's z: a rotation, and a place
 TR = "0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3"

@@ -28,13 +28,17 @@ from stillmap.core.config import STRICT, load_toml, override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.core.recording import Recording
 from stillmap.io.images import EXTENSIONS, read_image, read_image_size
-from stillmap.io.rigid_transforms import rigid_transform
-from stillmap.io.scan_files import (
-    assign_rows,
+from stillmap.io.text_lines import (
     list_files,
     read_times,
+    stamp_files,
     stamps_from_names,
     strip_extension,
+)
+from stillmap.io.trajectory import (
+    pose_from_quaternion,
+    pose_from_row,
+    rigid_transform,
 )
 
 Float = NDArray[np.float64]
@@ -45,6 +49,8 @@ MODELS = {"": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidista
 _Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # pixels, metres, seconds
 _Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
 _Matrix = list[_Number] | list[list[_Number]]
+_Three = Annotated[list[_Number], Field(min_length=3, max_length=3)]
+_Four = Annotated[list[_Number], Field(min_length=4, max_length=4)]
 _Path = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 
 
@@ -68,9 +74,9 @@ class CameraOverride:
     model: Literal["", "plumb_bob", "rational_polynomial", "equidistant"] | None = None
     distortion: list[_Number] | None = None
     T_base_camera: _Matrix | None = None
-    translation: list[_Number] | None = None
-    quaternion: list[_Number] | None = None
-    rpy: list[_Number] | None = None
+    translation: _Three | None = None
+    quaternion: _Four | None = None
+    rpy: _Three | None = None
     time_offset: _Number = 0.0
     folder: _Path | None = None
     times: _Path | None = None
@@ -97,38 +103,31 @@ class CameraOverride:
         given = [v for v in (self.fx, self.fy, self.cx, self.cy) if v is not None]
         if len(given) not in (0, 4) or (given and self.K is not None):
             raise ValueError("give either 'K', or 'fx', 'fy', 'cx' and 'cy'")
+        if not given and self.K is None:
+            return None
         if given:
             fx, fy, cx, cy = given
-            K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        elif self.K is None:
-            return None
-        else:
-            K = _to_matrix("K", self.K, 3)
+        K = _to_matrix("K", [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]] if given else self.K, 3)
         if not (K[0, 0] > 0.0 and K[1, 1] > 0.0 and K[1, 0] == 0.0):
             raise ValueError("focal lengths must be positive")
         return K
 
     def pose(self) -> Float | None:
         """(4, 4) T_base_camera."""
-        t, angles = self.translation, [v for v in (self.quaternion, self.rpy) if v is not None]
+        t, rotations = self.translation, [v for v in (self.quaternion, self.rpy) if v is not None]
         if self.T_base_camera is not None:
-            if t is not None or angles:
+            if t is not None or rotations:
                 raise ValueError("'T_base_camera' excludes 'translation', 'quaternion' and 'rpy'")
-            T = _to_matrix("T_base_camera", self.T_base_camera, 4)
-            return rigid_transform(T[:3, :3], T[:3, 3])
-        if t is None and not angles:
+            return pose_from_row(_to_matrix("T_base_camera", self.T_base_camera, 4)[:3])
+        if t is None and not rotations:
             return None
-        if t is None or len(t) != 3 or len(angles) != 1:
+        if t is None or len(rotations) != 1:
             raise ValueError("a pose needs 'translation', and one of 'quaternion' and 'rpy'")
+        if self.quaternion is not None:
+            return pose_from_quaternion(self.quaternion[3:] + self.quaternion[:3], t)
         from scipy.spatial.transform import Rotation  # slow to load
 
-        if len(angles[0]) != (4 if self.rpy is None else 3):
-            raise ValueError("'quaternion' has 4 numbers, 'rpy' 3")
-        if self.rpy is not None:
-            return rigid_transform(Rotation.from_euler("xyz", self.rpy).as_matrix(), t)
-        if not abs(np.linalg.norm(angles[0]) - 1.0) < 0.02:
-            raise ValueError("'quaternion' (x, y, z, w) is not of length one")
-        return rigid_transform(Rotation.from_quat(angles[0]).as_matrix(), t)
+        return rigid_transform(Rotation.from_euler("xyz", rotations[0]).as_matrix(), t)
 
     @property
     def time_offset_ns(self) -> int:
@@ -149,7 +148,7 @@ class CameraOverride:
         return replace(camera, **{name: v for name, v in given.items() if v is not None})
 
 
-def _to_matrix(name: str, numbers: list[float] | list[list[float]], n: int) -> Float:
+def _to_matrix(name: str, numbers: Any, n: int) -> Float:
     """A matrix (n, n) whose last row is 0 ... 0 1.
 
     Raises:
@@ -174,29 +173,25 @@ def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str
     Raises:
         InputError: it cannot be read, or a name, key or value is invalid.
     """
-    out, tables = {}, load_toml(path)
-    for name, table in tables.items():
+    out, where = {}, str(path)
+    for name, table in load_toml(path).items():
         if not isinstance(table, Mapping):
             hint = "a camera is a table: [NAME], with its values below"
-            raise InputError(f"'{name}' stands outside of a camera", where=str(path), hint=hint)
+            raise InputError(f"'{name}' stands outside of a camera", where=where, hint=hint)
         if known is not None and name not in known and "folder" not in table:
-            what = f"there is no camera '{name}'"
-            raise InputError(what, where=str(path), hint=_hint(name, known))
-    for name, table in tables.items():
+            hint = "the recording has no images; folder = '...' adds some"
+            if known:
+                nearest = closest_match(name, known, min_similarity=0.0)
+                hint = f"nearest: '{nearest}'; folder = '...' adds one"
+            raise InputError(f"there is no camera '{name}'", where=where, hint=hint)
         try:
             out[name] = override(CameraOverride(), table)
         except InputError as error:
             what = f"camera '{name}': {error.what}"
-            raise InputError(what, where=str(path), hint=error.hint) from error
+            raise InputError(what, where=where, hint=error.hint) from error
     if not out:
-        raise InputError("names no camera", where=str(path), hint="a table for each: [NAME]")
+        raise InputError("names no camera", where=where, hint="a table for each: [NAME]")
     return out
-
-
-def _hint(name: str, known: Sequence[str]) -> str:
-    if not known:
-        return "the recording has no images; folder = '...' adds some"
-    return f"nearest: '{closest_match(name, known, min_similarity=0.0)}'; folder = '...' adds one"
 
 
 _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((0, 0)))
@@ -308,16 +303,13 @@ def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) ->
         raise InputError("holds no images", where=str(folder))
     if given.times is not None:
         file = where.parent / given.times
-        times = read_times(file)
-        rows = assign_rows(files, len(times), file)
-        stamps = [None if row is None else times[row] for row in rows]
+        used = stamp_files(files, read_times(file), file)
     else:
         named = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
         if named is None:
             hint = f"times = 'FILE' in camera '{name}' of {where}: one line of seconds per image"
             raise InputError("holds images whose names are no stamps", where=str(folder), hint=hint)
-        stamps = list(named)
-    used = [(s, f) for s, f in zip(stamps, files, strict=True) if s is not None]
+        used = list(zip(named, files, strict=True))
     if not used:
         raise InputError("holds no usable stamp", where=str(given.times))
     width, height = read_image_size(used[0][1])

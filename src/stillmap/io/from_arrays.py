@@ -15,7 +15,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.builder import RecordingBuilder
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.lasers import RawLaser, RawLasers, unit_vectors
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 from stillmap.prepare.prepare import prepare

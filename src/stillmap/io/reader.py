@@ -20,8 +20,8 @@ from stillmap.core.source import Part, SensorNotes, Skipped, Source
 from stillmap.io import cameras
 from stillmap.io.builder import MAX_LINE_NUMBERS, ReadContext, part_context, reorder_scans
 from stillmap.io.registry import Format, detect_format
-from stillmap.io.rigid_transforms import MAX_MOUNT, are_rigid
 from stillmap.io.text_lines import Progress
+from stillmap.io.trajectory import MAX_MOUNT, are_rigid
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import complete, interpret
 from stillmap.prepare.time_window import TimeWindow, select_time

@@ -18,8 +18,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.carmen.log import SCAN_KINDS
 from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
 from stillmap.io.ros import messages
-from stillmap.io.scan_files import contains_files, has_extension
-from stillmap.io.text_lines import read_head
+from stillmap.io.text_lines import contains_files, has_extension, read_head
 from stillmap.prepare.lasers import RawLasers
 from stillmap.prepare.time_window import TimeWindow, select_time
 

@@ -32,9 +32,8 @@ from stillmap.io.cameras import CameraOverride
 from stillmap.io.images import read_image, read_image_size
 from stillmap.io.point_cloud.clouds import Cloud, CloudSource, build_recording, reject
 from stillmap.io.rgbd_calibration import calibrate_color_camera
-from stillmap.io.rigid_transforms import rigid_transform
 from stillmap.io.text_lines import read_lines
-from stillmap.io.trajectory import read_tum
+from stillmap.io.trajectory import read_tum, rigid_transform
 from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]

@@ -29,17 +29,19 @@ from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.images import read_image, write_png
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.options import MAX_POINT_DISTANCE
 
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 
 _IMAGES = "images"
-_ARRAYS = (
-    *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
-    *("T_odom_base", "beam_time", "T_recorded_base"),
-)
+_OPTIONAL = {  # arrays that may be missing, by the entry of the header that says so
+    "odometry": "T_odom_base",
+    "beam_times": "beam_time",
+    "recorded_poses": "T_recorded_base",
+}
+_ARRAYS = ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor", *_OPTIONAL.values())
 _MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
 _Count = Annotated[int, Field(ge=0, lt=1 << 60)]
 _Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
@@ -96,10 +98,7 @@ def _write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[st
     write_npy(folder / "image_stamp_ns.npy", images.stamp_ns[kept])
     write_npy(folder / "image_camera.npy", images.camera[kept])
     cameras = [
-        {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(camera).items()
-        }
+        {name: np.array(value).tolist() for name, value in vars(camera).items()}
         for camera in images.cameras
     ]
     warnings = [f"{len(lost)} images left out: {lost[0]}"] if lost else []
@@ -113,12 +112,9 @@ def _read_images(path: Path, header: _Header) -> Images | None:
     stamp_ns = np.array(read_array(path / "image_stamp_ns.npy", (header.images,), np.int64))
     camera = np.array(read_array(path / "image_camera.npy", (header.images,), np.int32))
     cameras = tuple(
-        Camera(
-            name=noted.name,
-            width=noted.width,
-            height=noted.height,
+        replace(
+            Camera(**vars(noted)),
             K=_matrix(noted.K, 3),
-            model=noted.model,
             distortion=np.array(noted.distortion, np.float64),
             T_base_camera=_matrix(noted.T_base_camera, 4),
         )
@@ -142,14 +138,15 @@ def _load_image(folder: Path, image: int) -> NDArray[Any]:
     return np.array(pixels)
 
 
-def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write a recording folder atomically.
+def write(recording: Recording, path: str | Path, overwrite: bool = False) -> list[str]:
+    """Write a recording folder atomically; nothing is left out.
 
     Raises:
         InputError: `path` is not empty, or cannot be written.
     """
     with atomic_folder(Path(path), HEADER, overwrite) as work:
         write_into(recording, work)
+    return []
 
 
 def write_into(recording: Recording, folder: Path) -> None:
@@ -165,9 +162,7 @@ def write_into(recording: Recording, folder: Path) -> None:
         "scans": recording.n_scans,
         "beams": recording.n_beams,
         "sensors": len(recording.T_base_sensor),
-        "odometry": recording.T_odom_base is not None,
-        "beam_times": recording.beam_time is not None,
-        "recorded_poses": recording.T_recorded_base is not None,
+        **{entry: getattr(recording, name) is not None for entry, name in _OPTIONAL.items()},
         **image_header,
         "source": source.to_dict(),
     }
@@ -257,12 +252,10 @@ def _read_header(path: Path) -> _Header:
 
 def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
     for block in iter_blocks(points, hit):
-        chunk = points[block]
-        usable = np.isfinite(chunk).all(axis=1)
-        if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
-            raise _damaged_error(path, "points", "a hit or a maximum-range beam is not finite")
-        if np.any(np.abs(chunk) > MAX_POINT_DISTANCE):
-            what = f"a beam ends farther than {MAX_POINT_DISTANCE:.0f} m away"
+        is_known = (np.abs(points[block]) <= MAX_POINT_DISTANCE).all(axis=1)
+        is_unusable = np.isnan(points[block]).any(axis=1) & ~hit[block]
+        if not np.all(is_known | is_unusable):
+            what = f"a beam's end is not finite, or farther than {MAX_POINT_DISTANCE:.0f} m away"
             raise _damaged_error(path, "points", what)
 
 

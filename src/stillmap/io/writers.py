@@ -4,6 +4,7 @@ The table of formats that are read is in `registry.py`.
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +14,9 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import require_new, require_new_file
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
-from stillmap.io.carmen.writer import write_log
 from stillmap.io.point_cloud import kitti, las, pcd, ply
-from stillmap.io.point_cloud.origin import place_clouds
-from stillmap.io.ros.messages import BagKind
-from stillmap.io.ros.writer import write_recording as write_bag
+from stillmap.io.point_cloud.clouds import describe_non_returns, place_clouds
+from stillmap.io.registry import load_later
 
 # (recording, path, overwrite) -> what could not be written, a sentence each
 Write = Callable[[Recording, Path, bool], list[str]]
@@ -49,90 +48,41 @@ class Writer(NamedTuple):
     endings: tuple[str, ...]
     marker: str
     write: Write
-    fields: tuple[str, ...] = ()
+    fields: tuple[str, ...] = _ODOMETRY
     max_dimension: int = 3
     max_sensors: int | None = None
 
 
-def _write_stillmap(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-    stillmap_folder.write(recording, path, overwrite=overwrite)
-    return []
-
-
-def _write_carmen(recording: Recording, path: Path, overwrite: bool) -> list[str]:  # noqa: ARG001
-    return write_log(recording, path)
-
-
-def _write_pcd(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-    pcd.write(recording, path, overwrite=overwrite)
-    return _describe_non_returns(recording)
-
-
-def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-    kitti.write(recording, path, overwrite=overwrite)
-    losses = _describe_non_returns(recording)
-    if recording.T_odom_base is None:
-        return losses
-    if recording.T_recorded_base is None:
-        return ["its odometry is written as poses", *losses]
-    return ["its odometry readings are left out", *losses]
-
-
-def _bag_writer(kind: BagKind, description: str, ending: str, marker: str = "") -> Writer:
-    def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-        return write_bag(recording, path, kind, overwrite=overwrite)
-
-    return Writer(kind, description, (ending,) if ending else (), marker, write, _ODOMETRY)
-
-
-def _cloud_writer(name: str, endings: tuple[str, ...], write_cloud: Callable[..., None]) -> Writer:
-    """A writer of all scans as one point cloud, by the poses that the recording has."""
-
-    def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:  # noqa: ARG001
-        T, losses = recording.T_recorded_base, []
-        if T is None:
-            T, losses = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
-        if T is None:
-            T = np.tile(np.eye(recording.dimension + 1), (recording.n_scans, 1, 1))
-            losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
-        write_cloud(recording, path, place_clouds(recording, T))
-        return [*losses, *_describe_non_returns(recording)]
-
-    return Writer(name, f"a {name.upper()} file", endings, "", write, _POSES + _ODOMETRY)
-
-
-def _describe_non_returns(recording: Recording) -> list[str]:
-    n = recording.n_beams - int(np.count_nonzero(recording.hit))
-    return [f"{n} beams without a return are left out"] if n else []
+def _write_cloud(
+    write: Callable[..., None], recording: Recording, path: Path, _: bool
+) -> list[str]:
+    """Write all scans as one point cloud, by the poses that the recording has."""
+    T, losses = recording.T_recorded_base, []
+    if T is None:
+        T, losses = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
+    if T is None:
+        T = np.tile(np.eye(recording.dimension + 1), (recording.n_scans, 1, 1))
+        losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
+    write(recording, path, place_clouds(recording, T))
+    return [*losses, *describe_non_returns(recording)]
 
 
 _LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz")
+_HEADER, _ALL = stillmap_folder.HEADER, tuple(_OPTIONAL_FIELDS)
+_PLACED = _POSES + _ODOMETRY
+_LOG, _BAG = load_later("carmen.writer", "write_log"), load_later("ros.writer", "write_recording")
+_PLY, _LAS = partial(_write_cloud, ply.write), partial(_write_cloud, las.write)
 WRITERS = (
-    Writer(
-        "stillmap",
-        "a recording folder",
-        (),
-        stillmap_folder.HEADER,
-        _write_stillmap,
-        tuple(_OPTIONAL_FIELDS),
-    ),
-    _bag_writer("ros2", "a ROS 2 bag folder", "", "metadata.yaml"),
-    Writer("carmen", "a CARMEN log", _LOGS, "", _write_carmen, _ODOMETRY, 2, max_sensors=2),
-    _bag_writer("bag", "a ROS 1 bag", ".bag"),
-    _bag_writer("db3", "a ROS 2 bag file", ".db3"),
-    _bag_writer("mcap", "an MCAP file", ".mcap"),
-    Writer(
-        "kitti",
-        "a KITTI folder",
-        (),
-        kitti.MARKER,
-        _write_kitti,
-        _POSES + _ODOMETRY,
-        max_sensors=1,
-    ),
-    Writer("pcd", "a folder of PCD files", (), pcd.MARKER, _write_pcd, _POSES, max_sensors=1),
-    _cloud_writer("ply", ply.EXTENSIONS, ply.write),
-    _cloud_writer("las", las.EXTENSIONS, las.write),
+    Writer("stillmap", "a recording folder", (), _HEADER, stillmap_folder.write, _ALL),
+    Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", partial(_BAG, "ros2")),
+    Writer("carmen", "a CARMEN log", _LOGS, "", _LOG, _ODOMETRY, 2, 2),
+    Writer("bag", "a ROS 1 bag", (".bag",), "", partial(_BAG, "bag")),
+    Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(_BAG, "db3")),
+    Writer("mcap", "an MCAP file", (".mcap",), "", partial(_BAG, "mcap")),
+    Writer("kitti", "a KITTI folder", (), kitti.MARKER, kitti.write, _PLACED, max_sensors=1),
+    Writer("pcd", "a folder of PCD files", (), pcd.MARKER, pcd.write, _POSES, max_sensors=1),
+    Writer("ply", "a PLY file", ply.EXTENSIONS, "", _PLY, _PLACED),
+    Writer("las", "a LAS file", las.EXTENSIONS, "", _LAS, _PLACED),
 )
 ENDINGS = ", ".join(ending for writer in WRITERS for ending in writer.endings)
 

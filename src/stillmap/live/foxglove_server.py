@@ -15,7 +15,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.io.rigid_transforms import embed_in_3d, quaternion_from_pose
+from stillmap.io.trajectory import embed_in_3d, quaternion_from_pose
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.movers import Mover
 from stillmap.live.scan import ScanBeams

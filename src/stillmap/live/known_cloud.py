@@ -15,8 +15,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
 from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
-from stillmap.io.rigid_transforms import are_rigid
-from stillmap.io.trajectory import read_tum
+from stillmap.io.trajectory import are_rigid, read_tum
 from stillmap.live.known_map import LOG_RATIO, ROUTE, KeptCloud, KeptMap, KnownMap
 from stillmap.live.sweep_view import STANDS, is_level
 from stillmap.places.evidence import cell_keys

@@ -23,7 +23,7 @@ from stillmap.io.from_arrays import (
     stamps_to_ns,
     to_array,
 )
-from stillmap.io.rigid_transforms import MAX_MOUNT
+from stillmap.io.trajectory import MAX_MOUNT
 from stillmap.prepare.max_range import MAX_ZERO_RANGE
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.slam import scan_hits

@@ -13,7 +13,7 @@ from stillmap.core.array_types import Float, Int64
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.em.types import CellProbabilities, ChangedCells, NoReturnModel
-from stillmap.io.point_cloud.origin import cloud_origin
+from stillmap.io.point_cloud.clouds import cloud_origin
 from stillmap.mapping import Change, Door
 from stillmap.pipeline.em_loop import Estimate
 from stillmap.pipeline.final_map import Maps

@@ -18,9 +18,8 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
 from stillmap.io.reader import read_parts
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.text_lines import Progress
-from stillmap.io.trajectory import poses_from_tum
+from stillmap.io.trajectory import MAX_TRANSLATION, poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
 from stillmap.pipeline.options import Options, OutputOptions
 from stillmap.prepare.options import ReadOptions

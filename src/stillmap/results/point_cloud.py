@@ -17,7 +17,7 @@ from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.table import TableLayout, read_columns
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.io.trajectory import MAX_TRANSLATION
 
 Part = Literal["static", "dynamic"]
 

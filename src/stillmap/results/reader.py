@@ -23,7 +23,7 @@ from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.io.trajectory import MAX_TRANSLATION
 
 Float = NDArray[np.float64]
 Origin = tuple[float, float, float]

@@ -206,8 +206,6 @@ def test_gzip_is_detected_by_content(log, flaser):
     unpacked = read(log(text, "unpacked.clf.gz"))
     np.testing.assert_array_equal(plain.points, packed.points)
     np.testing.assert_array_equal(plain.points, unpacked.points)
-    assert packed.source.details["gzip"]
-    assert not unpacked.source.details["gzip"]
 
 
 def test_unknown_kinds_are_counted(read_log, flaser):

@@ -58,7 +58,7 @@ def planar(T):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_laser_scans(tmp_path, driven, kind):
-    assert write_recording(driven, tmp_path / KINDS[kind], kind) == []
+    assert write_recording(kind, driven, tmp_path / KINDS[kind]) == []
     topics, told = decoded(tmp_path / KINDS[kind])
     assert set(topics) == {"/scan", "/scan2", "/odom", "/tf", "/tf_static"}
     for s, topic in enumerate(("/scan", "/scan2")):
@@ -131,7 +131,7 @@ def clouds(beam_time=None):
 def test_clouds(tmp_path, kind, timed):
     times = np.linspace(-0.05, 0.05, 50).astype(np.float32)
     recording = clouds(times if timed else None)
-    [lost] = write_recording(recording, tmp_path / KINDS[kind], kind)
+    [lost] = write_recording(kind, recording, tmp_path / KINDS[kind])
     assert lost.startswith("1 beams at maximum range")
     topics, _ = decoded(tmp_path / KINDS[kind])
     for t, (time, cloud) in enumerate(topics["/points"]):
@@ -158,7 +158,7 @@ def test_scans_with_equal_stamps_share_the_odometry(tmp_path, driven):
     stamp_ns, T = np.array(driven.stamp_ns), np.array(driven.T_odom_base)
     stamp_ns[1], T[1] = stamp_ns[0], T[0]
     same = dataclasses.replace(driven, stamp_ns=stamp_ns, T_odom_base=T)
-    write_recording(same, tmp_path / "a.bag", "bag")
+    write_recording("bag", same, tmp_path / "a.bag")
     topics, _ = decoded(tmp_path / "a.bag")
     assert [len(topics[name]) for name in ("/odom", "/tf", "/scan", "/scan2")] == [11, 11, 6, 6]
 
@@ -169,7 +169,7 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path, driven, kind):
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         path = tmp_path / folder / KINDS[kind]
-        write_recording(driven, path, kind)
+        write_recording(kind, driven, path)
         files = sorted(path.iterdir()) if path.is_dir() else [path]
         texts.append([(file.name, file.read_bytes()) for file in files])
         assert [entry.name for entry in path.parent.iterdir()] == [path.name]
@@ -181,11 +181,11 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path, driven, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_bag_appears_complete_or_not_at_all(tmp_path, driven, kind, monkeypatch):
     path = tmp_path / KINDS[kind]
-    write_recording(driven, path, kind)
+    write_recording(kind, driven, path)
     before = [(p, p.read_bytes()) for p in sorted(Path(tmp_path).rglob("*")) if p.is_file()]
     monkeypatch.setattr(LaserScanEncoder, "make_message", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_recording(driven, path, kind, overwrite=True)
+        write_recording(kind, driven, path, overwrite=True)
     assert [(p, p.read_bytes()) for p in sorted(tmp_path.rglob("*")) if p.is_file()] == before
 
 
@@ -196,7 +196,7 @@ def test_stamps_out_of_range(tmp_path, driven, kind, first, last):
     stamp_ns = np.linspace(first, last, 12).astype(np.int64) * 10**9
     odd = dataclasses.replace(driven, stamp_ns=stamp_ns)
     with pytest.raises(InputError, match="do not fit into a ROS bag"):
-        write_recording(odd, tmp_path / KINDS[kind], kind)
+        write_recording(kind, odd, tmp_path / KINDS[kind])
     assert not list(tmp_path.iterdir())
 
 

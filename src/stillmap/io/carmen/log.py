@@ -20,15 +20,23 @@ from array import array
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from sys import maxsize
 from typing import NamedTuple
 
-from stillmap.core.timestamps import parse_ns
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.timestamps import longest_non_decreasing, parse_ns
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
+from stillmap.prepare.lasers import RawLaser
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
+Float = NDArray[np.float64]
+
 BAD_LINE = "line that cannot be read"
+TIME_BACKWARDS = "time running backwards"
 WRONG_COUNT = "other number of readings than most scans"
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
@@ -125,12 +133,12 @@ def _is_stamp(fields: list[bytes]) -> bool:
     readings is noticed even where stamps are missing.
     """
     if len(fields) == 3:
-        is_host = fields[1].isdigit() or not is_number(fields[1])
-        return is_host and is_number(fields[2])
-    return len(fields) == 1 or (len(fields) == 2 and not is_number(fields[1]))
+        is_host = fields[1].isdigit() or not _is_number(fields[1])
+        return is_host and _is_number(fields[2])
+    return len(fields) == 1 or (len(fields) == 2 and not _is_number(fields[1]))
 
 
-def is_number(field: bytes) -> bool:
+def _is_number(field: bytes) -> bool:
     try:
         float(field)
     except ValueError:
@@ -164,26 +172,75 @@ def _parse_header(header: list[bytes], n: int) -> ScanConfig:
 
 
 class LaserLog:
-    """All scans of one kind of line (`FLASER`), in log order."""
+    """The scans of one kind of line (`FLASER`), in log order.
+
+    Attributes:
+        rows: line, stamp, count of readings, config and whether the host is a number, of each scan.
+        ranges: readings of all scans, one after the other.
+        configs: their numbers.
+        poses: laser x y theta, robot x y theta of each scan, if there are any.
+
+    Attributes of the T usable scans, once they are selected:
+        line, stamp_ns: (T,) line numbers, from 1, and stamps.
+        n_readings: of each.
+        robot_poses, laser_poses: (T, 3) on the lines; None: they have none.
+    """
+
+    line: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    n_readings: int
+    laser_poses: Float | None = None
+    robot_poses: Float | None = None
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
-        self.line, self.stamp_ns = array("q"), array("q")
-        self.count = array("q")  # readings per scan
-        self.host_is_number = array("b")  # in a log with named hosts a sign of shifted fields
-        self.ranges = array("f")  # readings of all scans, one after the other
-        self.config = array("q")  # index into configs
+        self.rows, self.ranges, self.poses = array("q"), array("f"), array("d")
         self.configs: dict[ScanConfig, int] = {}
-        self.poses = array("d")  # laser x y theta, robot x y theta of each scan, if there are any
+
+    def __len__(self) -> int:
+        return len(self.rows) // 5
 
     def add(self, line: int, scan: ScanLine) -> None:
-        self.line.append(line)
-        self.stamp_ns.append(scan.stamp_ns)
-        self.count.append(len(scan.ranges))
-        self.host_is_number.append(len(scan.stamp) > 1 and is_number(scan.stamp[1]))
+        # in a log with named hosts a number is a sign of shifted fields
+        is_number = len(scan.stamp) > 1 and _is_number(scan.stamp[1])
+        config = self.configs.setdefault(scan.config, len(self.configs))
+        self.rows.extend((line, scan.stamp_ns, len(scan.ranges), config, is_number))
         self.ranges.extend(scan.ranges)
-        self.config.append(self.configs.setdefault(scan.config, len(self.configs)))
         self.poses.extend(scan.poses)
+
+    def select_usable(self, skipped: SkippedRecords) -> None:
+        """Select the scans with the typical number of readings and non-decreasing stamps.
+
+        The longest non-decreasing subsequence of the laser's stamps is kept, so that a stamp that
+        jumps ahead costs one scan. Stamps of different lasers need not be in order.
+        """
+        line, stamps, count, config, shifted = np.asarray(self.rows).reshape(-1, 5).T
+        # the most frequent number, the larger of equally frequent ones
+        typical = max(Counter(count.tolist()).items(), key=lambda item: (item[1], item[0]))[0]
+        usable = (count == typical) & ~((shifted > 0) & (shifted.mean() < 0.5))
+        skipped.add_all(WRONG_COUNT, line[~usable])
+        scans = np.flatnonzero(usable)
+        forward = longest_non_decreasing(stamps[scans].tolist())
+        skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
+        scans = scans[forward]
+        self.n_readings, self.line, self.stamp_ns = typical, line[scans], stamps[scans]
+        self._start, self._shape = (np.cumsum(count) - count)[scans], config[scans]
+        if len(self.poses):
+            poses = np.asarray(self.poses).reshape(-1, 6)[scans]
+            self.laser_poses, self.robot_poses = poses[:, :3], poses[:, 3:]
+
+    def raw(self, directions: list[Float], max_range: float | None = None) -> RawLaser:
+        """The usable scans with the directions (n, 2) of each config."""
+        return RawLaser(
+            self.kind,
+            self.stamp_ns,
+            np.frombuffer(self.ranges, np.float32),
+            self._start,
+            self._shape,
+            list(directions),
+            max_range=max_range,
+            sample=maxsize,
+        )
 
 
 class CarmenLog:

@@ -1,11 +1,9 @@
 """Reads CARMEN logs (`.log`, `.clf`, plain or gzip)."""
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from sys import maxsize
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +11,18 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError, advise
 from stillmap.core.source import LaserPose, SensorNotes, Source
-from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory
 from stillmap.io.builder import ReadContext
 from stillmap.io.carmen.log import (
     SCAN_KINDS,
     WITHOUT_ANGLES,
-    WRONG_COUNT,
     CarmenLog,
     LaserLog,
     flaser_config,
     read_log,
 )
-from stillmap.io.text_lines import Line, is_gzip, read_head
-from stillmap.prepare.lasers import RawLaser, RawLasers, scan_order, unit_vectors
+from stillmap.io.text_lines import Line, read_head
+from stillmap.prepare.lasers import RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
@@ -72,9 +68,7 @@ def read_parts(
         raise _no_scan_error(paths[0], log)
     raw = _describe_lasers(scans, log, context.options)
     source = raw.source
-    source.path, source.format, source.part = str(paths[0]), "carmen", window.part
-    source.duplicates = duplicates
-    source.details["gzip"] = is_gzip(paths[0])
+    source.path, source.part, source.duplicates = str(paths[0]), window.part, duplicates
     return raw
 
 
@@ -87,43 +81,7 @@ def _no_scan_error(path: Path, log: CarmenLog) -> InputError:
     return InputError(what, where=str(path), hint=f"a CARMEN log has lines of {kinds}")
 
 
-class LaserLines(NamedTuple):
-    """T usable scan lines of one laser with n readings each.
-
-    Attributes:
-        log: of its kind of line.
-        scans: (T,) indices in the log.
-        line: (T,) line numbers, from 1.
-        stamp_ns: (T,).
-        poses: (T, 6) laser and robot pose on the lines; None: they have none.
-    """
-
-    log: LaserLog
-    scans: NDArray[np.intp]
-    line: NDArray[np.int64]
-    stamp_ns: NDArray[np.int64]
-    poses: Float | None
-
-    @property
-    def n_readings(self) -> int:
-        return int(self.log.count[self.scans[0]])
-
-    def raw_laser(self, directions: list[Float], max_range: float | None = None) -> RawLaser:
-        """The scans with the directions (n, 2) of each of the log's configs."""
-        count = np.asarray(self.log.count)
-        return RawLaser(
-            self.log.kind,
-            self.stamp_ns,
-            np.frombuffer(self.log.ranges, np.float32),
-            (np.cumsum(count) - count)[self.scans],
-            np.asarray(self.log.config)[self.scans],
-            list(directions),
-            max_range=max_range,
-            sample=maxsize,
-        )
-
-
-def select_scans(log: CarmenLog) -> tuple[list[LaserLines], list[str]]:
+def select_scans(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
     """The usable scans of each laser, and sentences on dropped kinds of lines.
 
     One kind of line per laser is used: newer logs hold each scan raw and with the robot's pose.
@@ -133,65 +91,44 @@ def select_scans(log: CarmenLog) -> tuple[list[LaserLines], list[str]]:
         by_position.setdefault(_position(laser.kind, log.params), []).append(laser)
     used, notes = [], []
     for same in by_position.values():
-        most = max(len(laser.line) for laser in same)
+        most = max(map(len, same))
         # a kind with only a few of the scans cannot replace the others
-        complete = [laser for laser in same if 2 * len(laser.line) >= most]
+        complete = [laser for laser in same if 2 * len(laser) >= most]
         best = min(complete, key=lambda laser: _KIND_ORDER.index(laser.kind.rstrip("1234")))
         used.append(best)
         notes += [
-            f"{laser.kind}: {len(laser.line)} scans not used, {best.kind} shows the same laser"
+            f"{laser.kind}: {len(laser)} scans not used, {best.kind} shows the same laser"
             for laser in same
             if laser is not best
         ]
     used.sort(key=lambda laser: SCAN_KINDS.index(laser.kind.encode()))
-    return [_select_usable_scans(laser, log) for laser in used], notes
+    for laser in used:
+        laser.select_usable(log.skipped_scans[laser.kind])
+    return used, notes
 
 
-def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> LaserLines:
-    """The scans with the typical number of readings and non-decreasing stamps.
-
-    The longest non-decreasing subsequence of the laser's stamps is kept, so that a stamp that jumps
-    ahead costs one scan. Stamps of different lasers need not be in order.
-    """
-    count, line = np.asarray(laser.count), np.asarray(laser.line)
-    # the most frequent number, the larger of equally frequent ones
-    typical = max(Counter(laser.count).items(), key=lambda item: (item[1], item[0]))[0]
-    shifted = np.asarray(laser.host_is_number, np.bool_)
-    # a number in place of the host name: the fields before it are shifted
-    usable = (count == typical) & ~(shifted & (shifted.mean() < 0.5))
-    skipped = log.skipped_scans[laser.kind]
-    skipped.add_all(WRONG_COUNT, line[~usable])
-    scans = np.flatnonzero(usable)
-    stamp_ns = np.asarray(laser.stamp_ns, np.int64)[scans]
-    forward = longest_non_decreasing(stamp_ns.tolist())
-    skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
-    scans = scans[forward]
-    poses = np.asarray(laser.poses).reshape(-1, 6)[scans] if len(laser.poses) else None
-    return LaserLines(laser, scans, line[scans], stamp_ns[forward], poses)
-
-
-def _describe_lasers(lines: list[LaserLines], log: CarmenLog, options: ReadOptions) -> RawLasers:
-    options.check_laser_count(len(lines))
-    skipped = log.skipped.merge(*(log.skipped_scans[own.log.kind] for own in lines))
-    warnings = skipped.loss_warnings(sum(len(own.stamp_ns) for own in lines))
-    lasers, poses, sensors = [], [], []
-    for number, own in enumerate(lines):
-        given, kind = options.laser(number), own.log.kind
-        pose = find_pose(own, log.params, warnings).override(given.pose)
-        upside_down, upside_down_how = _find_upside_down(kind, log.params, given)
-        angles = _find_angles(own, log.params, given, warnings)
+def _describe_lasers(used: list[LaserLog], log: CarmenLog, options: ReadOptions) -> RawLasers:
+    options.check_laser_count(len(used))
+    skipped = log.skipped.merge(*(log.skipped_scans[laser.kind] for laser in used))
+    warnings = skipped.loss_warnings(sum(len(laser.line) for laser in used))
+    lasers, mounts, sensors = [], [], []
+    for number, laser in enumerate(used):
+        given = options.laser(number)
+        pose = find_pose(laser, log.params, warnings).override(given.pose)
+        upside_down, upside_down_how = _find_upside_down(laser.kind, log.params, given)
+        angles = _find_angles(laser, log.params, given, warnings)
         angles = -angles if upside_down else angles
-        every = angles[:, :1] + angles[:, 1:] * np.arange(own.n_readings)
-        max_range = _find_max_range(own.log, log.params)
-        laser = own.raw_laser([unit_vectors(row) for row in every], max_range)
-        first, step = angles[laser.typical_shape].tolist()
-        lasers.append(laser)
-        poses.append(pose.matrix()[None])
+        every = angles[:, :1] + angles[:, 1:] * np.arange(laser.n_readings)
+        max_range = _find_max_range(laser, log.params)
+        raw = laser.raw([unit_vectors(row) for row in every], max_range)
+        first, step = angles[raw.typical_shape].tolist()
+        lasers.append(raw)
+        mounts.append(pose.matrix()[None])
         sensors.append(
             SensorNotes(
-                kind,
-                scans=len(own.stamp_ns),
-                beams_per_scan=own.n_readings,
+                laser.kind,
+                scans=len(laser.line),
+                beams_per_scan=laser.n_readings,
                 start_angle=first,
                 angle_step=step,
                 upside_down=upside_down,
@@ -199,10 +136,11 @@ def _describe_lasers(lines: list[LaserLines], log: CarmenLog, options: ReadOptio
                 extrinsics=pose,
             )
         )
-    odometry, odometry_notes = _find_odometry(lines, log, warnings)
+    odometry, odometry_notes = _find_odometry(used, log, warnings)
     T_odom_base = None if odometry is None else se2.matrix(*odometry[scan_order(lasers)].T)
     params = {k: v for k, v in log.params.items() if k.startswith("robot_") and "laser" in k}
     source = Source(
+        format="carmen",
         details={"lines": log.n_lines},
         records=dict(log.records),
         ignored=dict(log.ignored),
@@ -213,7 +151,7 @@ def _describe_lasers(lines: list[LaserLines], log: CarmenLog, options: ReadOptio
         skipped=skipped.by_reason(),
         warnings=warnings,
     )
-    return RawLasers(lasers, poses, T_odom_base, source)
+    return RawLasers(lasers, mounts, T_odom_base, source)
 
 
 def _param(params: dict[str, str], name: str) -> float | None:
@@ -238,15 +176,15 @@ def _position(kind: str, params: dict[str, str]) -> str:
     return kind
 
 
-def find_pose(lines: LaserLines, params: dict[str, str], warnings: list[str]) -> LaserPose:
+def find_pose(laser: LaserLog, params: dict[str, str], warnings: list[str]) -> LaserPose:
     """The pose of a laser on the robot; adds warnings.
 
     In this order: the median pose of the laser relative to the robot on the scan lines, if scans
     agree on it; PARAMs; facing backwards for RLASER; the robot's center.
     """
-    kind = lines.log.kind
-    if lines.poses is not None:
-        offset, alike = _median_offset(lines.poses)
+    kind = laser.kind
+    if laser.laser_poses is not None and laser.robot_poses is not None:
+        offset, alike = _median_offset(laser.laser_poses, laser.robot_poses)
         x, y, theta = (round(float(value), 6) for value in offset)
         if alike and is_stated_by_lines(x, y, theta):
             return LaserPose(x, y, theta, "scan lines")
@@ -277,9 +215,9 @@ def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
     return distance < _MAX_OFFSET and max(distance, abs(theta)) > _MIN_OFFSET
 
 
-def _median_offset(poses: Float) -> tuple[Float, bool]:
+def _median_offset(laser: Float, robot: Float) -> tuple[Float, bool]:
     """Median (x, y, theta) of the laser in the robot's frame, and whether scans agree on it."""
-    T_odom_sensor, T_odom_base = se2.matrix(*poses[:, :3].T), se2.matrix(*poses[:, 3:].T)
+    T_odom_sensor, T_odom_base = se2.matrix(*laser.T), se2.matrix(*robot.T)
     offsets = se2.parameters(se2.inverse(T_odom_base) @ T_odom_sensor)
     # unwrap about the first: angles near pi lie on both sides of the cut
     offsets[:, 2] = offsets[0, 2] + se2.wrap(offsets[:, 2] - offsets[0, 2])
@@ -302,10 +240,10 @@ def _find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) ->
 
 
 def _find_angles(
-    lines: LaserLines, params: dict[str, str], given: LaserOptions, warnings: list[str]
+    laser: LaserLog, params: dict[str, str], given: LaserOptions, warnings: list[str]
 ) -> Float:
     """(C, 2) first angle and step in radians of each of the laser's configs, as declared."""
-    kind, n, configs = lines.log.kind, lines.n_readings, list(lines.log.configs)
+    kind, n, configs = laser.kind, laser.n_readings, list(laser.configs)
     angles = np.array([config[:2] for config in configs])
     if kind in WITHOUT_ANGLES:
         fov = given.fov
@@ -340,7 +278,7 @@ def _find_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
 
 
 def _find_odometry(
-    lines: list[LaserLines], log: CarmenLog, warnings: list[str]
+    lasers: list[LaserLog], log: CarmenLog, warnings: list[str]
 ) -> tuple[Float | None, dict[str, Any]]:
     """Robot poses (T, 3) at the scans of all lasers, one laser after the other.
 
@@ -349,24 +287,24 @@ def _find_odometry(
     """
     odom_ns = np.asarray(log.odom_stamp_ns, np.int64)
     odom = np.asarray(log.odom_poses).reshape(-1, 3)
-    own = {k: laser.poses[:, 3:] for k, laser in enumerate(lines) if laser.poses is not None}
+    own = {laser.kind: laser.robot_poses for laser in lasers if laser.robot_poses is not None}
     if len(odom) and own and not any(map(_moves, own.values())) and _moves(odom):
         own = {}
     if not len(odom) and own:
-        odom_ns = np.concatenate([lines[k].stamp_ns for k in own])
+        odom_ns = np.concatenate([laser.stamp_ns for laser in lasers if laser.kind in own])
         odom = np.concatenate(list(own.values()))
     if not len(odom):
         return None, {"from": None, "outside": 0}
     poses, outside = [], 0
-    for k, laser in enumerate(lines):
-        at_scans, n_outside = own.get(k), 0
+    for laser in lasers:
+        at_scans, n_outside = own.get(laser.kind), 0
         if at_scans is None:
             at_scans, n_outside = trajectory.interpolate(odom_ns, odom, laser.stamp_ns)
         poses.append(at_scans)
         outside += n_outside
     out = np.concatenate(poses)
     interpolated = "ODOM lines" if len(log.odom_stamp_ns) else "other lasers' scan lines"
-    kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(lines) else [])
+    kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(lasers) else [])
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
     if len(out) > 1 and not _moves(out):

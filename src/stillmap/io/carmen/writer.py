@@ -17,11 +17,12 @@ from stillmap.io import laser_scan
 from stillmap.io.carmen.log import (
     BYTE_ORDER_MARK,
     SCAN_KINDS,
+    LaserLog,
     first_reading,
     flaser_config,
     read_log,
 )
-from stillmap.io.carmen.reader import LaserLines, is_stated_by_lines, select_scans
+from stillmap.io.carmen.reader import is_stated_by_lines, select_scans
 from stillmap.io.filter_writers import FilterJob, Omissions, other_recording_error
 from stillmap.io.text_lines import read_lines, replace_words, write_atomically
 from stillmap.prepare.max_range import MIN_ZERO_SHARE, find_max_range
@@ -77,8 +78,8 @@ class LogFormat:
     params: dict[str, str]
 
 
-def write_log(recording: Recording, path: Path) -> list[str]:
-    """Write a CARMEN log, gzip by its name; it appears complete or not at all.
+def write_log(recording: Recording, path: Path, overwrite: bool = True) -> list[str]:  # noqa: ARG001
+    """Write a CARMEN log, gzip by its name; it appears complete or not at all, and replaces a file.
 
     With odometry FLASER and RLASER lines where lasers cover half a circle and ranges fit, else
     ROBOTLASER lines; without odometry RAWLASER lines.
@@ -239,7 +240,7 @@ def write_filtered(job: FilterJob) -> Omissions:
     scan_of = _number_lines(job, lasers)
     codes = [
         find_no_return_code(
-            own.raw_laser([np.empty((own.n_readings, 2))] * len(own.log.configs)).sample_readings(),
+            own.raw([np.empty((own.n_readings, 2))] * len(own.configs)).sample_readings(),
             notes.ranges,
         )
         for own, notes in zip(lasers, recording.source.sensors, strict=True)
@@ -280,7 +281,7 @@ def find_no_return_code(readings: NDArray[np.float32], rule: RangeRule | None) -
     return f"{_OVERFLOW if longest < _OVERFLOW else 10.0 * longest:.2f}".encode("ascii")
 
 
-def _number_lines(job: FilterJob, lasers: list[LaserLines]) -> dict[int, int]:
+def _number_lines(job: FilterJob, lasers: list[LaserLog]) -> dict[int, int]:
     """The scan of the recording by line number."""
     if lasers:
         stamp_ns = np.concatenate([own.stamp_ns for own in lasers])
@@ -293,5 +294,7 @@ def _number_lines(job: FilterJob, lasers: list[LaserLines]) -> dict[int, int]:
 
 def _blank_readings(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
     """A scan line with the readings `blank` (n,) replaced by the code."""
-    first = first_reading(text.removeprefix(BYTE_ORDER_MARK).split(maxsplit=1)[0])
-    return replace_words(text, {first + k: code for k in np.flatnonzero(blank).tolist()})
+    line = text.removeprefix(BYTE_ORDER_MARK)
+    first = first_reading(line.split(maxsplit=1)[0])
+    codes = {first + k: code for k in np.flatnonzero(blank).tolist()}
+    return text[: len(text) - len(line)] + replace_words(line, codes)

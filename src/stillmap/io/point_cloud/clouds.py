@@ -1,6 +1,7 @@
-"""Point clouds from files, one by one, into a recording; the clock of their time column."""
+"""Point clouds from files, one by one, into a recording; their common origin, which may be that
+of a country; hits to write."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -9,26 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import finite_rows
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
-from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
-from stillmap.io.point_cloud.origin import Origin
-from stillmap.io.scan_files import list_files, stamps_from_names, strip_extension
+from stillmap.io.point_cloud.table import Clock, convert_times, detect_clock
+from stillmap.io.text_lines import list_files, stamps_from_names, strip_extension
+from stillmap.io.trajectory import MAX_TRANSLATION, embed_in_3d
 from stillmap.prepare.options import MAX_POINT_DISTANCE
 from stillmap.prepare.time_window import TimeWindow
 
 _MAX_NAMES = 5  # of skipped files in a warning
-
-_TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
-_UNITS = (1, 10**3, 10**6, 10**9)  # per second: s, ms, us, ns
-_SINCE_1970 = (6e8, 5e9)  # s: the years 1989 to 2128
-# the limits differ by less than 1000: at most one unit fits
-_SCAN_DURATION = (0.005, 2.0)  # s
-_PERIOD_SHARE = (0.05, 1.5)  # duration of a scan over the time between stamps
-_SAME_CLOCK_NS = 10 * 10**9
 
 
 class Cloud(NamedTuple):
@@ -243,83 +237,6 @@ def _usable_mask(points: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(plausible & np.any(points != 0, axis=1))
 
 
-class Clock(NamedTuple):
-    """Unit and epoch of a time column.
-
-    Attributes:
-        per_second: units per second.
-        absolute: times count from 1970; else from the scan's stamp.
-    """
-
-    per_second: int
-    absolute: bool
-
-
-def find_time_column(names: Iterable[str]) -> str | None:
-    """The name of the time column; None: there is none."""
-    return next((name for name in names if name.lower() in _TIME_NAMES), None)
-
-
-def detect_clock(values: NDArray[Any], period: float | None) -> Clock | None:
-    """The one unit that gives a scan a plausible duration; None: none or several.
-
-    Args:
-        values: (n,) as recorded; not finite: unknown.
-        period: seconds between stamps; None: unknown.
-    """
-    values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-    if not len(values):
-        return None
-    first, last = float(values.min()), float(values.max())
-    for unit in _UNITS:
-        # absolute times differ by little within a scan
-        if _SINCE_1970[0] < first / unit < _SINCE_1970[1] and last - first < 0.01 * first:
-            return Clock(unit, True)
-    limits = [_SCAN_DURATION]
-    if period is not None and period > 0:
-        limits.append((_PERIOD_SHARE[0] * period, _PERIOD_SHARE[1] * period))
-    fitting = {
-        unit for unit in _UNITS for low, high in limits if low <= (last - first) / unit <= high
-    }
-    return Clock(fitting.pop(), False) if len(fitting) == 1 else None
-
-
-def convert_times(
-    values: NDArray[Any], usable: NDArray[np.bool_], clock: Clock, stamp_ns: int | None
-) -> tuple[int | None, NDArray[np.float64]]:
-    """The stamp of a scan, and seconds (n,) from it to each point, NaN where unknown.
-
-    Args:
-        values: (n,) as recorded.
-        usable: (n,) mask of valid points.
-        clock: unit and epoch.
-        stamp_ns: stamp of the scan; None: the first absolute time.
-    """
-    if not clock.absolute:
-        return stamp_ns, _drop_outliers(values.astype(np.float64) / clock.per_second)
-    unit = 10**9 // clock.per_second  # ns
-    known = usable & np.isfinite(values) & (values > 0) & (values < MAX_STAMP_NS / unit)
-    after = np.full(len(values), np.nan)
-    if not known.any():
-        return stamp_ns, after
-    kept = values[known]
-    if kept.dtype.kind == "f":
-        ns = np.round(kept * float(unit)).astype(np.int64)
-    else:  # integers stay exact
-        ns = kept.astype(np.int64) * unit
-    middle = np.partition(ns, len(ns) // 2)[len(ns) // 2]
-    first = int(ns[np.abs(ns - middle) < int(MAX_BEAM_TIME * 1e9)].min())
-    if stamp_ns is None:
-        stamp_ns = first
-    same_clock = abs(stamp_ns - first) < _SAME_CLOCK_NS
-    after[known] = (ns - (stamp_ns if same_clock else first)) / 1e9
-    return stamp_ns, _drop_outliers(after)
-
-
-def _drop_outliers(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(np.abs(seconds) <= MAX_BEAM_TIME, seconds, np.nan)
-
-
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
     """Turn errors of a library about damaged bytes into InputError."""
@@ -334,3 +251,126 @@ def library_errors(path: Path) -> Iterator[None]:
             raise
         what = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"is damaged: {what}", where=str(path)) from error
+
+
+_BLOCK = 1 << 20  # beams transformed at once
+_MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
+
+
+class Origin:
+    """Common origin of all clouds of a recording, so that float32 coordinates stay precise.
+
+    Unless `position` (3,) is given: zero where the first block of points is near the origin, else
+    its median, rounded to metres.
+    """
+
+    def __init__(self, position: NDArray[np.float64] | None = None) -> None:
+        self.position = position
+
+    def shift(self, points: NDArray[Any]) -> NDArray[np.float32]:
+        """(n, 3) points relative to the origin, of recorded points (n, 3) in metres."""
+        points = np.asarray(points, np.float64)
+        if self.position is None:
+            self.position = _find_origin(points)
+        with np.errstate(over="ignore"):
+            return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
+
+    def place(self, recording: Recording) -> None:
+        """Let the recorded poses of scans whose points were shifted say so, in place: they are the
+        scans without a rotation and a position, beside others that have them."""
+        T = recording.T_recorded_base
+        if T is not None and self.position is not None:
+            is_unplaced = np.equal(T, np.eye(4)).all(axis=(1, 2))
+            T[is_unplaced, :3, 3] = self.position
+
+    def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
+        """Note the origin in the source of a recording, and warn that the sensor is assumed there;
+        neither where points are `in_sensor_frame` and near its origin."""
+        if self.position is not None and np.any(self.position != 0.0):
+            recording.source.origin = tuple(self.position.tolist())
+            at = " ".join(f"{value:.0f}" for value in self.position)
+            at = f"{at}, the new origin"
+        elif in_sensor_frame:
+            return
+        else:
+            at = "the origin"
+        recording.source.warnings.append(f"no sensor pose is recorded: beams start at {at}")
+
+
+def cloud_origin(recording: Recording) -> NDArray[np.float64]:
+    """(3,) metres by which the coordinates of a recording's clouds were shifted in reading."""
+    noted = recording.source.origin if recording.dimension == 3 else None
+    origin = np.array(noted or (0.0, 0.0, 0.0))
+    return origin if (np.abs(origin) < MAX_TRANSLATION).all() else np.zeros(3)
+
+
+def place_clouds(
+    recording: Recording, poses: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """Poses (T, D+1, D+1) for writing; None: there are none, and the coordinates are as they were.
+
+    Args:
+        recording: T scans.
+        poses: as the recording has them; None: there are none.
+    """
+    origin = cloud_origin(recording)
+    if not origin.any() or recording.T_recorded_base is not None:
+        return poses
+    if poses is None:
+        poses = np.tile(np.eye(4), (recording.n_scans, 1, 1))
+    placed = np.array(poses)
+    placed[:, :3, 3] += origin
+    return placed
+
+
+def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    finite = points[finite_rows(points)]
+    if not len(finite):
+        return None
+    # column by column: np.median(axis=0) takes several times as long
+    middle = np.array([np.median(column) for column in finite.T])
+    return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
+
+
+def sensor_poses(
+    recording: Recording, T_map_base: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """(T, 4, 4) sensor poses of robot poses (T, D+1, D+1), for writing; see `place_clouds`."""
+    T = place_clouds(recording, T_map_base)
+    return None if T is None else embed_in_3d(recording.T_map_sensor(T))
+
+
+def scan_hits(
+    recording: Recording, scan: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """(n, 3) hits of a scan in the sensor frame, and their times (n,) or None."""
+    beams = recording.beams_of(scan)
+    hit = recording.hit[beams]
+    times = None if recording.beam_time is None else recording.beam_time[beams][hit]
+    return _to_3d(recording.points[beams][hit]), times
+
+
+def iter_map_points(
+    recording: Recording, T_map_base: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
+    """Yield all hits in the map frame in blocks (n, 3), in recording order.
+
+    Args:
+        recording: 2D hits lie at z = 0.
+        T_map_base: (T, D+1, D+1).
+    """
+    for start in range(0, recording.n_beams, _BLOCK):
+        hit = start + np.flatnonzero(recording.hit[start : start + _BLOCK])
+        yield _to_3d(recording.end_points(hit, T_map_base))
+
+
+def _to_3d(points: NDArray[Any]) -> NDArray[Any]:
+    if points.shape[1] == 3:
+        return points
+    return np.column_stack([points, np.zeros(len(points), points.dtype)])
+
+
+def describe_non_returns(recording: Recording) -> list[str]:
+    """What clouds lack of a recording, a sentence each."""
+    n = recording.n_beams - int(np.count_nonzero(recording.hit))
+    return [f"{n} beams without a return are left out"] if n else []

@@ -23,11 +23,11 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import (
     Cloud,
     CloudSource,
+    Origin,
     build_recording,
     files_of,
     library_errors,
 )
-from stillmap.io.point_cloud.origin import Origin
 from stillmap.io.point_cloud.table import (
     Columns,
     gather_points,
@@ -35,7 +35,7 @@ from stillmap.io.point_cloud.table import (
     require_all,
     truncated_error,
 )
-from stillmap.io.rigid_transforms import pose_from_quaternion
+from stillmap.io.trajectory import pose_from_quaternion
 
 EXTENSIONS, MAGIC = (".e57",), b"ASTM-E57"
 GPS_EPOCH_S = 315_964_800  # 6 January 1980 since 1970, without leap seconds

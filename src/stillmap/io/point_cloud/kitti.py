@@ -21,11 +21,16 @@ from stillmap.core.timestamps import format_seconds
 from stillmap.io import cameras, images
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
-from stillmap.io.point_cloud.clouds import Cloud, CloudSource
-from stillmap.io.point_cloud.origin import scan_hits, sensor_poses
+from stillmap.io.point_cloud.clouds import (
+    Cloud,
+    CloudSource,
+    describe_non_returns,
+    scan_hits,
+    sensor_poses,
+)
 from stillmap.io.point_cloud.table import Field, TableLayout, parse_numbers
-from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
-from stillmap.io.scan_files import assign_rows, list_files, read_times
+from stillmap.io.text_lines import assign_rows, list_files, read_times, stamp_files
+from stillmap.io.trajectory import pose_from_row, rigid_transform
 
 Float = NDArray[np.float64]
 
@@ -286,9 +291,7 @@ def _list_images(place: Path, times: list[int | None]) -> list[tuple[int, Path]]
     files = list_files(inner, images.EXTENSIONS)
     own = place / "timestamps.txt"
     times = read_times(own) if own.is_file() else times
-    rows = assign_rows(files, len(times), place) if files else []
-    stamps = (None if row is None else times[row] for row in rows)
-    return [(stamp, file) for stamp, file in zip(stamps, files, strict=True) if stamp is not None]
+    return stamp_files(files, times, place)
 
 
 def _make_camera(
@@ -313,10 +316,11 @@ def _make_camera(
     return Camera(name, width, height, K, "", np.zeros(0), T_laser_camera)
 
 
-def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
+def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str]:
     """Write an odometry sequence with the hits of each scan in the sensor frame, atomically.
 
-    The recorded poses, else the odometry, become `poses.txt`.
+    The recorded poses, else the odometry, become `poses.txt`. Returns what is left out, a sentence
+    each.
 
     Raises:
         InputError: `path` is taken or cannot be written.
@@ -324,7 +328,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
     T = sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))
-    with atomic_folder(Path(path), MARKER, overwrite) as folder:
+    with atomic_folder(path, MARKER, overwrite) as folder:
         (folder / "velodyne").mkdir()
         for scan in recording.iter_scans(range(recording.n_scans)):
             points, _ = scan_hits(recording, scan)
@@ -339,3 +343,9 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
             lines = (" ".join(f"{v:.17g}" for v in pose[:3].ravel()) for pose in T)
             text = "".join(f"{row}\n" for row in lines)
             (folder / "poses.txt").write_text(text, encoding="ascii")
+    losses = describe_non_returns(recording)
+    if recording.T_odom_base is None:
+        return losses
+    if recording.T_recorded_base is None:
+        return ["its odometry is written as poses", *losses]
+    return ["its odometry readings are left out", *losses]

@@ -16,8 +16,13 @@ from stillmap.core.files import atomic_file
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.clouds import Cloud, library_errors, read_clouds
-from stillmap.io.point_cloud.origin import Origin, iter_map_points
+from stillmap.io.point_cloud.clouds import (
+    Cloud,
+    Origin,
+    iter_map_points,
+    library_errors,
+    read_clouds,
+)
 from stillmap.io.point_cloud.table import gather_points, open_table, require_all, truncated_error
 
 EXTENSIONS, MAGIC = (".las", ".laz"), b"LASF"

@@ -22,10 +22,15 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
-from stillmap.io.point_cloud.clouds import Cloud
-from stillmap.io.point_cloud.origin import Origin, scan_hits, sensor_poses
+from stillmap.io.point_cloud.clouds import (
+    Cloud,
+    Origin,
+    describe_non_returns,
+    scan_hits,
+    sensor_poses,
+)
 from stillmap.io.point_cloud.table import Columns, Field, TableLayout
-from stillmap.io.rigid_transforms import pose_from_quaternion, quaternion_from_pose
+from stillmap.io.trajectory import pose_from_quaternion, quaternion_from_pose
 
 EXTENSIONS = (".pcd",)
 MARKER = "*.pcd"  # only folders with such a file are overwritten
@@ -175,7 +180,7 @@ def read(path: Path, context: ReadContext) -> Recording:
 def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
     layout, T = read_header(path)
     T_sensor_map = np.eye(4) if T is None or not in_map_frame else se2.inverse(T)
-    time = clouds.find_time_column(field.name for field in layout.fields)
+    time = table.find_time_column(field.name for field in layout.fields)
     names = ["x", "y", "z", *([time] if time else [])]
 
     def to_sensor(points: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -213,18 +218,18 @@ def _detect_map_frame(files: list[Path]) -> bool:
     return False
 
 
-def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
+def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str]:
     """Write a folder of binary PCD files with the hits of each scan in the sensor frame.
 
     Names are stamps in nanoseconds, with `_1` and so on for repeated stamps. VIEWPOINT is the
     recorded pose of the sensor, or where a cloud without one lies; `time` is in seconds after the
-    stamp.
+    stamp. Returns what is left out, a sentence each.
 
     Raises:
         InputError: `path` is taken or cannot be written.
     """
     T = sensor_poses(recording, recording.T_recorded_base)
-    with atomic_folder(Path(path), MARKER, overwrite) as folder:
+    with atomic_folder(path, MARKER, overwrite) as folder:
         repeats = 0
         for scan in recording.iter_scans(range(recording.n_scans)):
             stamp = int(recording.stamp_ns[scan])
@@ -233,6 +238,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
             name = f"{stamp:0{20 if stamp < 0 else 19}d}" + (f"_{repeats}" if repeats else "")
             pose = np.eye(4) if T is None else T[scan]
             (folder / f"{name}.pcd").write_bytes(_encode_scan(recording, scan, pose))
+    return describe_non_returns(recording)
 
 
 def _encode_scan(recording: Recording, scan: int, T: NDArray[np.float64]) -> bytes:

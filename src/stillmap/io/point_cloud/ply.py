@@ -12,8 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.clouds import Cloud, read_clouds
-from stillmap.io.point_cloud.origin import Origin, iter_map_points
+from stillmap.io.point_cloud.clouds import Cloud, Origin, iter_map_points, read_clouds
 from stillmap.io.point_cloud.table import (
     Field,
     TableLayout,

@@ -1,4 +1,4 @@
-"""Tables of points in files: text lines or binary records, with columns by name.
+"""Tables of points in files: text lines or binary records, columns by name, the clock of times.
 
 Counts in a header are checked against the size of the file before memory is allocated.
 """
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -15,10 +15,19 @@ from numpy.typing import DTypeLike, NDArray
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
+from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.text_lines import read_lines
 
 _BLOCK = 1 << 18  # points read at once
 _MAX_RECORD = 1 << 16  # bytes of one point
+
+_TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
+_UNITS = (1, 10**3, 10**6, 10**9)  # per second: s, ms, us, ns
+_SINCE_1970 = (6e8, 5e9)  # s: the years 1989 to 2128
+# the limits differ by less than 1000: at most one unit fits
+_SCAN_DURATION = (0.005, 2.0)  # s
+_PERIOD_SHARE = (0.05, 1.5)  # duration of a scan over the time between stamps
+_SAME_CLOCK_NS = 10 * 10**9
 
 Columns = Sequence[NDArray[Any]]  # values (k,) of each column
 
@@ -233,3 +242,80 @@ def parse_numbers(
     except (ValueError, OverflowError) as error:
         what = f"is damaged: {str(error).partition(';')[0]}"
         raise InputError(what, where=str(path)) from error
+
+
+class Clock(NamedTuple):
+    """Unit and epoch of a time column.
+
+    Attributes:
+        per_second: units per second.
+        absolute: times count from 1970; else from the scan's stamp.
+    """
+
+    per_second: int
+    absolute: bool
+
+
+def find_time_column(names: Iterable[str]) -> str | None:
+    """The name of the time column; None: there is none."""
+    return next((name for name in names if name.lower() in _TIME_NAMES), None)
+
+
+def detect_clock(values: NDArray[Any], period: float | None) -> Clock | None:
+    """The one unit that gives a scan a plausible duration; None: none or several.
+
+    Args:
+        values: (n,) as recorded; not finite: unknown.
+        period: seconds between stamps; None: unknown.
+    """
+    values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    if not len(values):
+        return None
+    first, last = float(values.min()), float(values.max())
+    for unit in _UNITS:
+        # absolute times differ by little within a scan
+        if _SINCE_1970[0] < first / unit < _SINCE_1970[1] and last - first < 0.01 * first:
+            return Clock(unit, True)
+    limits = [_SCAN_DURATION]
+    if period is not None and period > 0:
+        limits.append((_PERIOD_SHARE[0] * period, _PERIOD_SHARE[1] * period))
+    fitting = {
+        unit for unit in _UNITS for low, high in limits if low <= (last - first) / unit <= high
+    }
+    return Clock(fitting.pop(), False) if len(fitting) == 1 else None
+
+
+def convert_times(
+    values: NDArray[Any], usable: NDArray[np.bool_], clock: Clock, stamp_ns: int | None
+) -> tuple[int | None, NDArray[np.float64]]:
+    """The stamp of a scan, and seconds (n,) from it to each point, NaN where unknown.
+
+    Args:
+        values: (n,) as recorded.
+        usable: (n,) mask of valid points.
+        clock: unit and epoch.
+        stamp_ns: stamp of the scan; None: the first absolute time.
+    """
+    if not clock.absolute:
+        return stamp_ns, _drop_outliers(values.astype(np.float64) / clock.per_second)
+    unit = 10**9 // clock.per_second  # ns
+    known = usable & np.isfinite(values) & (values > 0) & (values < MAX_STAMP_NS / unit)
+    after = np.full(len(values), np.nan)
+    if not known.any():
+        return stamp_ns, after
+    kept = values[known]
+    if kept.dtype.kind == "f":
+        ns = np.round(kept * float(unit)).astype(np.int64)
+    else:  # integers stay exact
+        ns = kept.astype(np.int64) * unit
+    middle = np.partition(ns, len(ns) // 2)[len(ns) // 2]
+    first = int(ns[np.abs(ns - middle) < int(MAX_BEAM_TIME * 1e9)].min())
+    if stamp_ns is None:
+        stamp_ns = first
+    same_clock = abs(stamp_ns - first) < _SAME_CLOCK_NS
+    after[known] = (ns - (stamp_ns if same_clock else first)) / 1e9
+    return stamp_ns, _drop_outliers(after)
+
+
+def _drop_outliers(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(np.abs(seconds) <= MAX_BEAM_TIME, seconds, np.nan)

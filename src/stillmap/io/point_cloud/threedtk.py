@@ -22,9 +22,8 @@ from stillmap.io.point_cloud.clouds import (
     files_of,
 )
 from stillmap.io.point_cloud.table import Field, TableLayout, is_blank, read_columns, require_all
-from stillmap.io.rigid_transforms import rigid_transform
-from stillmap.io.scan_files import strip_extension
-from stillmap.io.text_lines import read_lines
+from stillmap.io.text_lines import read_lines, strip_extension
+from stillmap.io.trajectory import rigid_transform
 
 EXTENSIONS = (".3d", ".3d.gz")
 

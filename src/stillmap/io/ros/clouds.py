@@ -15,13 +15,13 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes, Source
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import RecordingBuilder, SkippedRecords
-from stillmap.io.point_cloud.clouds import (
-    Cloud,
+from stillmap.io.point_cloud.clouds import Cloud
+from stillmap.io.point_cloud.table import (
     convert_times,
     detect_clock,
     find_time_column,
+    record_dtype,
 )
-from stillmap.io.point_cloud.table import record_dtype
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
     TIME_BACKWARDS,

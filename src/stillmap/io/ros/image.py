@@ -15,7 +15,6 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.rigid_transforms import rigid_transform
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -26,6 +25,7 @@ from stillmap.io.ros.messages import (
     stamp_ns,
 )
 from stillmap.io.ros.tf import TransformTree
+from stillmap.io.trajectory import rigid_transform
 
 _MAX_PIXELS = 1 << 27
 _RAW = {  # encoding: type, channels, indices of red, green and blue

@@ -12,8 +12,8 @@ from stillmap.core import se2
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.ros.messages import frame_name, stamp_ns
+from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]

@@ -291,7 +291,7 @@ def make_pose(T: Float, position: str = "position", orientation: str = "orientat
 
 
 def write_recording(
-    recording: Recording, path: Path, kind: BagKind, *, overwrite: bool = False
+    kind: BagKind, recording: Recording, path: Path, overwrite: bool = False
 ) -> list[str]:
     """Write a recording as a ROS bag: scans, odometry, and the sensors' extrinsics.
 

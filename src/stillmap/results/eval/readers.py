@@ -222,7 +222,8 @@ def _log_rows(log: CarmenLog) -> Float:
     for laser in log.lasers.values():
         if len(laser.poses):
             poses = np.asarray(laser.poses).reshape(-1, 6)[:, 3:]
-            return np.column_stack([to_seconds(np.asarray(laser.stamp_ns)), poses])
+            stamps = np.asarray(laser.rows).reshape(len(laser), -1)[:, 1]
+            return np.column_stack([to_seconds(stamps), poses])
     return np.zeros((0, 4))
 
 
