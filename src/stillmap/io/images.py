@@ -22,7 +22,10 @@ _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 _MAX_PIXELS = 64 << 20
 _UNPACKED = 1 << 20  # pixels of an image that become an array at a time
 
-_MODES_16_BIT = {"I;16", "I;16B", "I;16L", "I;16N", "I"}
+_DTYPES: dict[str, Any] = {  # by Pillow's mode; others become RGB
+    **{"L": np.uint8, "F": np.float32},
+    **dict.fromkeys(("I;16", "I;16B", "I;16L", "I;16N", "I"), np.uint16),
+}
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
@@ -42,23 +45,18 @@ def read_image(path: Path) -> NDArray[Any]:
         InputError: it is no image, damaged, or cannot be read.
     """
     with _open(path) as image:
-        if image.mode == "L":
-            return _unpack(image, np.uint8)
-        if image.mode in _MODES_16_BIT:
-            return _unpack(image, np.uint16)
-        if image.mode == "F":
-            return _unpack(image, np.float32)
-        return _unpack(image, np.uint8, is_color=True)
+        return to_array(image)
 
 
-def _unpack(image: Image.Image, dtype: Any, *, is_color: bool = False) -> NDArray[Any]:
+def to_array(image: Image.Image) -> NDArray[Any]:
     """The array of an image, some rows at a time: at once it takes twice the memory."""
-    width, height = image.size
-    out = np.empty((height, width, 3) if is_color else (height, width), dtype)
+    dtype, (width, height) = _DTYPES.get(image.mode), image.size
+    shape = (height, width) if dtype else (height, width, 3)
+    out = np.empty(shape, dtype or np.uint8)
     rows = max(_UNPACKED // max(width, 1), 1)
     for first in range(0, height, rows):
         part = image.crop((0, first, width, min(first + rows, height)))
-        out[first : first + rows] = part.convert("RGB") if is_color else part
+        out[first : first + rows] = part if dtype else part.convert("RGB")
     return out
 
 

@@ -37,15 +37,12 @@ def share_progress(progress: Progress | None, number: int, count: int) -> Progre
 class Line(NamedTuple):
     """One line: its number from 1, and its bytes up to `MAX_LINE`.
 
-    `ended` is False where the file stops without a line end, `damaged` True on a last empty line
-    that stands for a broken gzip stream.
+    `damage` says why it is no line: it is too long, or stands for a broken gzip stream.
     """
 
     number: int
     text: bytes
-    ended: bool = True
-    too_long: bool = False
-    damaged: bool = False
+    damage: str = ""
 
 
 @contextmanager
@@ -95,19 +92,18 @@ def read_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
             while text := stream.readline(MAX_LINE):
                 number += 1
                 size_read += len(text) + _LINE_COST
-                ended = text.endswith(b"\n")
-                too_long = not ended and len(text) == MAX_LINE
-                if too_long:
+                is_whole = text.endswith(b"\n") or len(text) < MAX_LINE
+                if not is_whole:
                     size_read += _skip_rest(stream, limit - size_read)
                 if size_read > limit:
                     what = f"is too large: it decompresses to more than {_MAX_RATIO} times its size"
                     hint = "decompress it first"
                     raise InputError(what, where=str(path), hint=hint)
-                yield Line(number, text, ended, too_long)
+                yield Line(number, text, "" if is_whole else "a line is too long")
                 if progress is not None and number % 500 == 0:
                     progress(min(file.tell() / size, 1.0))
         except _DAMAGED:
-            yield Line(number + 1, b"", damaged=True)
+            yield Line(number + 1, b"", "its gzip stream breaks")
         except OSError as error:
             raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
 

@@ -263,7 +263,7 @@ class CarmenLog:
         """Add a line; one that cannot be used is counted."""
         self.n_lines = line.number
         fields = line.text.split()
-        if line.damaged or line.too_long:
+        if line.damage:
             self.skipped.add(BAD_LINE, line.number)
         elif line.text.lstrip().startswith(_COMMENT):
             self.ignored["comments"] += 1
@@ -285,7 +285,9 @@ class CarmenLog:
         try:
             record = _parse_odometry(fields) if is_pose else parse_scan(name, fields)
             # a line without an end may have lost fields, or digits of its stamp, unnoticed
-            if not line.ended and len(record.stamp) < self._stamp_fields.get(name, 1):
+            if not line.text.endswith(b"\n") and len(record.stamp) < self._stamp_fields.get(
+                name, 1
+            ):
                 raise ValueError(BAD_LINE)
         except ValueError:
             skipped.add(BAD_LINE, line.number)
@@ -299,7 +301,8 @@ class CarmenLog:
             self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, record)
 
     def _ignore(self, line: Line, name: bytes) -> None:
-        if not line.ended and any(kind.startswith(name) for kind in (*SCAN_KINDS, b"ODOM")):
+        is_cut = not line.text.endswith(b"\n")
+        if is_cut and any(kind.startswith(name) for kind in (*SCAN_KINDS, b"ODOM")):
             self.skipped.add(BAD_LINE, line.number)
             return
         kind = _text(name)

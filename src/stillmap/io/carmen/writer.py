@@ -253,7 +253,7 @@ def write_filtered(job: FilterJob) -> Omissions:
             if t is not None:
                 blank, code = job.blank[recording.beams_of(t)], codes[recording.sensor[t]]
                 file.write(_blank_readings(line.text, blank, code))
-            elif line.damaged or line.too_long or (name and name[0] in SCAN_KINDS):
+            elif line.damage or (name and name[0] in SCAN_KINDS):
                 omitted += 1
             else:
                 file.write(line.text)

@@ -214,9 +214,8 @@ def iter_text_lines(path: Path, skip: int = 0) -> Iterator[bytes]:
         InputError: a line is too long, or the gzip stream is damaged or too large.
     """
     for line in read_lines(path):
-        if line.damaged or line.too_long:
-            what = "is a damaged gzip file" if line.damaged else "is damaged: a line is too long"
-            raise InputError(what, where=f"{path}:{line.number}")
+        if line.damage:
+            raise InputError(f"is damaged: {line.damage}", where=f"{path}:{line.number}")
         if line.number > skip and not is_blank(line.text):
             yield line.text
 

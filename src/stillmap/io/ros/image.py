@@ -3,7 +3,6 @@
 import io
 import re
 import warnings
-from array import array
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -15,6 +14,7 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
+from stillmap.io.images import to_array
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -51,8 +51,7 @@ class ImageCollector:
     """Collects the headers of images, and the cameras' calibrations."""
 
     def __init__(self) -> None:
-        self._stamp_ns, self._log_ns = array("q"), array("q")
-        self._topic: list[str] = []
+        self._headers: list[tuple[int, int, str]] = []  # stamp, log time, topic
         self._infos: dict[str, Any] = {}  # CameraInfo by topic
         self._frames: dict[str, str] = {}
 
@@ -67,9 +66,7 @@ class ImageCollector:
         if message.channel.type == CAMERA_INFO:
             self._infos.setdefault(topic, content)
             return
-        self._stamp_ns.append(stamp)
-        self._log_ns.append(message.log_ns)
-        self._topic.append(topic)
+        self._headers.append((stamp, message.log_ns, topic))
         self._frames.setdefault(topic, frame)
 
     def build_images(
@@ -77,21 +74,15 @@ class ImageCollector:
     ) -> Images | None:
         """The images of a recording, raw ones where a camera has both; None without any."""
         topics = _select_topics(sorted(self._frames))
-        order = [k for k, topic in enumerate(self._topic) if topic in topics]
-        if not order:
+        headers = [header for header in self._headers if header[2] in topics]
+        if not headers:
             return None
-        order.sort(key=lambda k: self._stamp_ns[k])
-        cameras = tuple(self._camera(topic, tree, base) for topic in topics)
-
-        def load(image: int) -> NDArray[Any]:
-            k = order[image]
-            return _load_image(reopen(), self._topic[k], self._log_ns[k], self._stamp_ns[k])
-
+        headers.sort(key=lambda header: header[0])
         return Images(
-            np.array([self._stamp_ns[k] for k in order], np.int64),
-            np.array([topics.index(self._topic[k]) for k in order], np.int32),
-            cameras,
-            load,
+            np.array([stamp for stamp, _, _ in headers], np.int64),
+            np.array([topics.index(topic) for _, _, topic in headers], np.int32),
+            tuple(self._camera(topic, tree, base) for topic in topics),
+            lambda image: _load_image(reopen(), *headers[image]),
         )
 
     def _camera(self, topic: str, tree: TransformTree, base: str) -> Camera:
@@ -148,7 +139,7 @@ def _select_topics(topics: list[str]) -> list[str]:
     return sorted(by_camera.values())
 
 
-def _load_image(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
+def _load_image(bag: Bag, stamp: int, log_ns: int, topic: str) -> NDArray[Any]:
     try:
         for message in bag.messages({topic}, log_ns):
             content = decode(message)
@@ -194,8 +185,7 @@ def _decompress(data: bytes) -> NDArray[Any]:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP", "TIFF")) as image:
             if image.width * image.height > _MAX_PIXELS:
                 raise InputError("an image is too large")
-            whole = image if image.mode in ("L", "I;16", "F") else image.convert("RGB")
-            return np.array(whole)
+            return to_array(image)
 
 
 def _demosaic(values: NDArray[Any], pattern: str) -> NDArray[Any]:
