@@ -14,36 +14,14 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "io" / "ros"))
 
-from small_bags import Messages, write_bag
-
-FLOAT, DOUBLE, U32 = 7, 8, 6
+from small_bags import DOUBLE, FLOAT, UINT32, Messages, cloud_message, write_bag
 
 
 def _cloud(messages: Messages, stamp: int, big: bool = False) -> tuple[str, Any]:
-    rng, order = np.random.default_rng(3), ">" if big else "<"
-    layout = [("x", FLOAT, "f4"), ("y", FLOAT, "f4"), ("z", DOUBLE, "f8"), ("t", U32, "u4")]
-    dtype = np.dtype([(name, order + kind) for name, _, kind in layout])
-    rows = np.zeros(8, dtype)
-    for name in "xyz":
-        rows[name] = rng.normal(0, 5, 8)
-    rows["t"] = np.linspace(0, 9e7, 8)
-    fields = [
-        messages.make("sensor_msgs/msg/PointField", name, dtype.fields[name][1], kind, 1)
-        for name, kind, _ in layout
-    ]
-    kind = "sensor_msgs/msg/PointCloud2"
-    return kind, messages.make(
-        kind,
-        messages.header(stamp, "lidar"),
-        height=2,
-        width=4,
-        fields=fields,
-        is_bigendian=big,
-        point_step=dtype.itemsize,
-        row_step=4 * dtype.itemsize,
-        data=rows.view(np.uint8).ravel(),
-        is_dense=True,
-    )
+    rng = np.random.default_rng(3)
+    columns = [(name, kind, rng.normal(0, 5, 8)) for name, kind in (("x", FLOAT), ("y", FLOAT))]
+    columns += [("z", DOUBLE, rng.normal(0, 5, 8)), ("t", UINT32, np.linspace(0, 9e7, 8))]
+    return cloud_message(messages, stamp, columns, height=2, big=big)
 
 
 def _image(messages: Messages, stamp: int) -> tuple[str, Any]:
@@ -61,36 +39,22 @@ def _compressed_image(messages: Messages, stamp: int) -> tuple[str, Any]:
 def _camera_info(messages: Messages, stamp: int) -> tuple[str, Any]:
     names = "DKRP" if messages.encoding == "ros1" else "dkrp"
     values = [np.zeros(5), np.eye(3).ravel() * 4, np.eye(3).ravel(), np.zeros(12)]
-    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    kind = "sensor_msgs/msg/CameraInfo"
+    kind, matrices = "sensor_msgs/msg/CameraInfo", dict(zip(names, values, strict=True))
     return kind, messages.make(
-        kind,
-        header=messages.header(stamp, "cam"),
-        height=2,
-        width=3,
-        distortion_model="plumb_bob",
-        binning_x=0,
-        binning_y=0,
-        roi=region,
-        **dict(zip(names, values, strict=True)),
+        kind, messages.header(stamp, "cam"), 2, 3, distortion_model="plumb_bob", **matrices
     )
 
 
 def _multi_echo(messages: Messages, stamp: int) -> tuple[str, Any]:
-    echo = [messages.make("sensor_msgs/msg/LaserEcho", np.array(e, np.float32)) for e in ([1], [])]
-    kind = "sensor_msgs/msg/MultiEchoLaserScan"
-    numbers = dict.fromkeys(("angle_max", "scan_time"), 0.0)
+    kind, echoes = "sensor_msgs/msg/MultiEchoLaserScan", [np.float32(e) for e in ([1], [])]
     return kind, messages.make(
         kind,
-        header=messages.header(stamp, "laser2"),
-        angle_min=0.0,
+        messages.header(stamp, "laser2"),
         angle_increment=0.1,
         time_increment=0.001,
         range_min=0.1,
         range_max=9.0,
-        ranges=echo,
-        intensities=[],
-        **numbers,
+        ranges=[{"echoes": echo} for echo in echoes],
     )
 
 

@@ -10,6 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from stillmap.io.ros.messages import load_typestore
+from stillmap.io.ros.writer import make_header, make_message
 
 KINDS = ("bag", "db3", "mcap", "folder")
 FLOAT, DOUBLE, UINT32, UINT16 = 7, 8, 6, 4
@@ -23,13 +24,13 @@ class Messages:
         self.encoding = encoding
         self.store = load_typestore(encoding)
 
-    def make(self, kind: str, *args: Any, **kwargs: Any) -> Any:
-        return self.store.types[kind](*args, **kwargs)
+    def make(self, kind: str, *args: Any, **fields: Any) -> Any:
+        """A message of its first fields and named ones; others are zero."""
+        names = [name for name, _ in self.store.fielddefs[kind][1]]
+        return make_message(self.store, kind, dict(zip(names, args, strict=False)) | fields)
 
     def header(self, stamp: int, frame: str) -> Any:
-        time = self.make("builtin_interfaces/msg/Time", *divmod(stamp, 10**9))
-        sequence = {"seq": 0} if self.encoding == "ros1" else {}
-        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
+        return make_header(stamp, frame)
 
     def scan(
         self, stamp: int, ranges: Any, frame: str = "laser", **changes: Any
@@ -39,37 +40,22 @@ class Messages:
             "angle_min": -0.5,
             "angle_max": 0.5,
             "angle_increment": 1.0 / max(len(ranges) - 1, 1),
-            "time_increment": 0.0,
-            "scan_time": 0.0,
             "range_min": 0.1,
             "range_max": 20.0,
-            "intensities": np.zeros(0, np.float32),
         } | changes
         kind = "sensor_msgs/msg/LaserScan"
         return kind, self.make(kind, header=self.header(stamp, frame), ranges=ranges, **fields)
 
     def pose(self, xyz: tuple[float, float, float], theta: float, flipped: bool = False) -> Any:
-        half = 0.5 * theta
-        q = (
-            (np.cos(half), np.sin(half), 0.0, 0.0)
-            if flipped
-            else (0.0, 0.0, np.sin(half), np.cos(half))
-        )
-        return xyz, q
+        c, s = np.cos(0.5 * theta), np.sin(0.5 * theta)
+        return xyz, (c, s, 0.0, 0.0) if flipped else (0.0, 0.0, s, c)
 
     def transform(
         self, stamp: int, parent: str, child: str, xyz: Any, q: Any = (0.0, 0.0, 0.0, 1.0)
     ) -> Any:
-        return self.make(
-            "geometry_msgs/msg/TransformStamped",
-            self.header(stamp, parent),
-            child,
-            self.make(
-                "geometry_msgs/msg/Transform",
-                self.make("geometry_msgs/msg/Vector3", *map(float, xyz)),
-                self.make("geometry_msgs/msg/Quaternion", *map(float, q)),
-            ),
-        )
+        place = _placed(xyz, q, "translation", "rotation")
+        header = self.header(stamp, parent)
+        return {"header": header, "child_frame_id": child, "transform": place}
 
     def tf(self, *transforms: Any) -> tuple[str, Any]:
         kind = "tf2_msgs/msg/TFMessage"
@@ -78,31 +64,19 @@ class Messages:
     def odometry(
         self, stamp: int, xyz: Any, q: Any, frame: str = "odom", child: str = "base_link"
     ) -> tuple[str, Any]:
-        point = self.make("geometry_msgs/msg/Point", *map(float, xyz))
-        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
-        zero = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-        kind = "nav_msgs/msg/Odometry"
-        message = self.make(
-            kind,
-            self.header(stamp, frame),
-            child,
-            self.make(
-                "geometry_msgs/msg/PoseWithCovariance",
-                self.make("geometry_msgs/msg/Pose", point, turn),
-                np.zeros(36),
-            ),
-            self.make(
-                "geometry_msgs/msg/TwistWithCovariance",
-                self.make("geometry_msgs/msg/Twist", zero, zero),
-                np.zeros(36),
-            ),
-        )
-        return kind, message
+        kind, pose = "nav_msgs/msg/Odometry", {"pose": _placed(xyz, q, "position", "orientation")}
+        return kind, self.make(kind, self.header(stamp, frame), child, pose)
 
     def raw(self, kind: str, message: Any) -> bytes:
         if self.encoding == "ros1":
             return bytes(self.store.serialize_ros1(message, kind))
         return bytes(self.store.serialize_cdr(message, kind))
+
+
+def _placed(xyz: Any, q: Any, *names: str) -> dict[str, Any]:
+    at, turn = map(float, xyz), map(float, q)
+    parts = dict(zip("xyz", at, strict=True)), dict(zip("xyzw", turn, strict=True))
+    return dict(zip(names, parts, strict=True))
 
 
 def write_bag(
@@ -171,8 +145,10 @@ def cloud_message(
     width = n // height
     rows = values.view(np.uint8).reshape(height, width * step)
     data = np.concatenate([rows, np.full((height, padding), 0xAB, np.uint8)], axis=1)
-    field = messages.store.types["sensor_msgs/msg/PointField"]
-    fields = [field(name, o, kind, 1) for (name, kind, _), o in zip(columns, offsets, strict=True)]
+    fields = [
+        {"name": name, "offset": o, "datatype": kind, "count": 1}
+        for (name, kind, _), o in zip(columns, offsets, strict=True)
+    ]
     stated = {
         "height": height,
         "width": width,

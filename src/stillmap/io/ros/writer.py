@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rosbags import interfaces, rosbag1, rosbag2
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from stillmap.core import files
@@ -78,7 +79,7 @@ class BagWriter:
         connection = self._add_connection(name, type, latched, typestore=self._store)
 
         def send(stamp_ns: int, fields: Fields) -> None:
-            raw = self.serialize(self._make(type, fields), type)
+            raw = self.serialize(make_message(self._store, type, fields), type)
             self._writer.write(connection, stamp_ns, raw)
 
         return send
@@ -107,29 +108,31 @@ class BagWriter:
         """The bytes of a message in this kind of bag."""
         return bytes(self._serialize(message, type))
 
-    def _make(self, type: str, fields: Fields) -> Any:
-        definition = self._store.fielddefs[type][1]
-        values = {name: self._value(kind, fields.get(name)) for name, kind in definition}
-        return self._store.types[type](**values)
-
-    def _value(self, kind: Any, given: Any) -> Any:
-        """A field: messages of their fields, anything else as it is given; zero where it is not."""
-        node, form = kind
-        if node == Nodetype.NAME:
-            return self._make(form, given or {})
-        if node == Nodetype.BASE:
-            return given if given is not None else "" if form[0] == "string" else 0
-        (item, name), count = form
-        if item == Nodetype.NAME:
-            return [self._make(name, fields) for fields in given or ()]
-        return np.zeros(count, name[0]) if given is None else given
-
     def _add_connection(self, topic: str, type: str, latched: bool, **options: Any) -> Any:
         if self.is_ros1:
             options = {"callerid": "/stillmap", "latching": int(latched), **options}
         else:
             options = {"offered_qos_profiles": [_TRANSIENT_LOCAL] if latched else [], **options}
         return self._writer.add_connection(topic, type, **options)
+
+
+def make_message(store: Typestore, type: str, fields: Fields) -> Any:
+    """A message of a type; its parts are given by their fields, or as messages."""
+    definition = store.fielddefs[type][1]
+    values = {name: _make_field(store, kind, fields.get(name)) for name, kind in definition}
+    return store.types[type](**values)
+
+
+def _make_field(store: Typestore, kind: Any, given: Any) -> Any:
+    node, form = kind
+    if node == Nodetype.NAME:
+        return make_message(store, form, given or {}) if isinstance(given, dict | None) else given
+    if node == Nodetype.BASE:
+        return given if given is not None else "" if form[0] == "string" else 0
+    (item, name), count = form
+    if item == Nodetype.NAME:
+        return [_make_field(store, (item, name), part) for part in given or ()]
+    return np.zeros(count, name[0]) if given is None else given
 
 
 def _digest(channel: Channel) -> str:
