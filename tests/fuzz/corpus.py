@@ -3,7 +3,9 @@
 import gzip
 import io
 import json
+import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import lzf
@@ -12,7 +14,10 @@ import pye57
 from parts import join_parts
 from PIL import Image
 
-from stillmap.core import se2
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from cut_recordings import N, make_recording
+
 from stillmap.core.arrays import write_npz
 from stillmap.core.camera import Camera, Images
 from stillmap.core.config import to_toml
@@ -22,48 +27,25 @@ from stillmap.io.point_cloud.las import _make_header
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.options import Options
 
-START = 1_700_000_000_000_000_000
+START = 1_600_000_000_000_000_000
 
 
-def recording_2d(scans: int = 6, beams: int = 9) -> Recording:
+def recording_2d(scans: int = 6) -> Recording:
     """A robot with a laser on a slightly curved path."""
-    rng = np.random.default_rng(1)
-    angle = np.linspace(-1.2, 1.2, beams)
-    length = rng.uniform(1.0, 8.0, (scans, beams, 1))
-    points = length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    t = np.arange(scans)
-    return Recording(
-        stamp_ns=START + 10**8 * t.astype(np.int64),
-        offset=np.arange(scans + 1, dtype=np.int64) * beams,
-        points=points.reshape(-1, 2).astype(np.float32),
-        hit=rng.random(scans * beams) < 0.9,
-        T_base_sensor=se2.matrix(0.1, 0.0, 0.0)[None],
-        sensor=np.zeros(scans, np.int32),
-        T_odom_base=se2.matrix(0.1 * t, 0.01 * t, 0.02 * t),
-    )
+    return make_recording(2, scans)
 
 
-def recording_3d(scans: int = 3, beams: int = 12) -> Recording:
-    """A 3D recording with poses, beam times and images."""
-    rng = np.random.default_rng(2)
-    T = np.tile(np.eye(4), (scans, 1, 1))
-    T[:, 0, 3] = 6.0 + np.arange(scans)
+def recording_3d() -> Recording:
+    """A 3D recording of three scans with poses, beam times and images."""
+    recording = make_recording(3, 3)
     pictures = [np.full((4, 6, 3), 50 * k, np.uint8) for k in range(2)]
     camera = Camera("cam", 6, 4, np.diag([4.0, 4.0, 1.0]), "plumb_bob", np.zeros(5), np.eye(4))
-    images = Images(
-        START + np.arange(2, dtype=np.int64), np.zeros(2, np.int32), (camera,), pictures.__getitem__
-    )
-    return Recording(
-        stamp_ns=START + 10**8 * np.arange(scans, dtype=np.int64),
-        offset=np.arange(scans + 1, dtype=np.int64) * beams,
-        points=rng.normal(0, 5, (scans * beams, 3)).astype(np.float32),
-        hit=np.ones(scans * beams, bool),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(scans, np.int32),
-        T_odom_base=T,
-        T_recorded_base=T,
-        beam_time=np.tile(np.linspace(0, 0.09, beams, dtype=np.float32), scans),
-        images=images,
+    stamps, first = START + np.arange(2, dtype=np.int64), np.zeros(2, np.int32)
+    return replace(
+        recording,
+        T_recorded_base=recording.T_odom_base,
+        beam_time=np.tile(np.linspace(0, 0.09, N, dtype=np.float32), 3),
+        images=Images(stamps, first, (camera,), pictures.__getitem__),
     )
 
 
@@ -223,7 +205,7 @@ def rows(work: Path) -> Iterator[bytes]:
     yield (work / "a.txt").read_bytes()
     yield b"# t x y theta\n1.5 0 0 0.1\n2.5 1 2 0.2 # said\n"
     yield b"1.5 2.5 1 0 0 0 0 0.1\n2.5 3.5 1 0 0 0 0 0.1\n"
-    writers.write(recording_2d(2, 3), work / "a.log")
+    writers.write(recording_2d(2), work / "a.log")
     yield (work / "a.log").read_bytes()
 
 

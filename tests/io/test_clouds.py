@@ -1,12 +1,10 @@
-"""PLY, LAS, LAZ and E57 clouds, damaged and hostile ones too."""
+"""PLY, LAS and LAZ clouds, damaged and hostile ones too."""
 
-import re
 import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from stillmap.core.errors import InputError
 from stillmap.core.source import Skipped
@@ -123,122 +121,6 @@ def test_chunks_that_are_not_there_do_not_end_the_process(survey):
     survey.write_bytes(content)
     with pytest.raises(InputError, match="table of chunks"):
         read(survey)
-
-
-@pytest.mark.slow
-def test_las_mutations(survey):
-    content, rng = survey.read_bytes(), np.random.default_rng(2)
-    for _ in range(300):
-        changed = bytearray(content)
-        for _ in range(rng.integers(1, 4)):
-            changed[rng.integers(len(changed))] = rng.integers(256)
-        survey.write_bytes(changed)
-        try:
-            read(survey)
-        except InputError:
-            continue
-
-
-@pytest.fixture
-def scanned(tmp_path):
-    """An E57 file of two scans, their points and poses."""
-    pye57 = pytest.importorskip("pye57")
-    rng = np.random.default_rng(5)
-    file = pye57.E57(str(tmp_path / "a.e57"), mode="w")
-    points, poses = rng.normal(0, 5, (2, 300, 3)).astype(np.float32), np.stack([np.eye(4)] * 2)
-    poses[1, :3, :3] = Rotation.from_euler("zyx", [0.5, 0.1, -0.2]).as_matrix()
-    poses[1, :3, 3] = 400_000, 5_000_000, 100
-    for scan, T in zip(points, poses, strict=True):
-        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), scan.T.copy(), strict=True))
-        columns["cartesianInvalidState"] = (np.arange(300) == 7).astype(np.int8)
-        file.write_scan_raw(columns, rotation=np.array([w, x, y, z]), translation=T[:3, 3])
-    file.close()
-    return tmp_path / "a.e57", points, poses
-
-
-def test_e57(scanned):
-    path, points, poses = scanned
-    found = read(path)
-    valid = np.arange(600) % 300 != 7
-    np.testing.assert_array_equal(found.hit, valid)
-    np.testing.assert_allclose(found.points[valid], points.reshape(-1, 3)[valid], atol=1e-6)
-    np.testing.assert_allclose(found.T_recorded_base, poses, atol=1e-9)
-    assert found.stamp_ns.tolist() == [0, 10**9]
-    both = path.with_name("b.e57")
-    both.write_bytes(path.read_bytes())
-    path.with_name("c.e57").write_bytes(path.read_bytes()[:5000])
-    folder = read(path.parent)
-    assert folder.n_scans == 4
-    assert folder.source.skipped["is damaged"].lines == [5]
-
-
-def checksum(page):
-    """CRC-32C."""
-    value = 0xFFFFFFFF
-    for byte in page:
-        value ^= byte
-        for _ in range(8):
-            value = (value >> 1) ^ (0x82F63B78 if value & 1 else 0)
-    return value ^ 0xFFFFFFFF
-
-
-def described(path, change):
-    """The file with another description."""
-    content = path.read_bytes()
-    plain = b"".join(content[i : i + 1020] for i in range(0, len(content), 1024))
-    start, length = plain.index(b"<?xml"), int.from_bytes(content[32:40], "little")
-    xml = change(plain[start : start + length])
-    plain = bytearray(plain[:start] + xml)
-    plain += bytes(-len(plain) % 1020)
-    struct.pack_into("<QQQ", plain, 16, len(plain) // 1020 * 1024,
-                     start // 1020 * 1024 + start % 1020, len(xml))  # fmt: skip
-    pages = (bytes(plain[i : i + 1020]) for i in range(0, len(plain), 1020))
-    path.write_bytes(b"".join(page + struct.pack(">I", checksum(page)) for page in pages))
-
-
-def test_e57_with_another_description_is_read(scanned):
-    path, *_ = scanned
-    described(path, lambda xml: re.sub(rb"<pose.*?</pose>", b"", xml, flags=re.DOTALL))
-    found = read(path)
-    assert found.n_scans == 2
-    assert found.T_recorded_base is None
-    assert "no sensor pose is recorded" in found.source.warnings[-1]
-
-
-@pytest.mark.parametrize("count", [b"301", b"5000", b"9999999999999"])
-def test_e57_that_promises_more(scanned, count):
-    path, *_ = scanned
-    old, new = b'recordCount="300"', b'recordCount="' + count + b'"'
-    described(path, lambda xml: xml.replace(old, new, 1))
-    found = read(path)
-    assert found.n_scans == 1
-    ((reason, damage),) = found.source.skipped.items()
-    assert reason in ("is truncated", "is damaged")
-    assert damage == Skipped(1, [1])
-
-
-def test_e57_with_entities_is_refused(scanned):
-    path, *_ = scanned
-    described(path, lambda xml: xml.replace(b"?>", b'?><!DOCTYPE a [<!ENTITY b "c">]>', 1))
-    with pytest.raises(InputError, match="entities"):
-        read(path)
-
-
-def test_e57_nested_without_end(scanned):
-    path, *_ = scanned
-    inner = b'<a type="Structure">' * 2000 + b"</a>" * 2000
-    described(path, lambda xml: xml.replace(b"</e57Root>", inner + b"</e57Root>"))
-    with pytest.raises(InputError, match="nested too deeply"):
-        read(path)
-
-
-@pytest.mark.parametrize("kept", [10, 48, 1024, 5000])
-def test_e57_that_is_cut(scanned, kept):
-    path, *_ = scanned
-    path.write_bytes(path.read_bytes()[:kept])
-    with pytest.raises(InputError, match=r"is (no E57|damaged)"):
-        read(path)
 
 
 @pytest.mark.parametrize(("name", "start"), [("a.las", b"LASF"), ("a.e57", b"ASTM-E57")])

@@ -6,7 +6,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -85,56 +84,3 @@ def test_damaged_gzip(lines, data):
     else:
         packed[at] = data.draw(st.integers(0, 255))
     require_valid(bytes(packed))
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.binary(max_size=300))
-def test_random_bytes(content):
-    require_valid(content)
-
-
-def mutated(log, rng):
-    """A log with bytes changed, and pieces deleted, repeated or moved."""
-    log = bytearray(log)
-    for _ in range(rng.integers(1, 9)):
-        at, to = (int(i) for i in rng.integers(0, len(log), 2))
-        piece = log[at : at + int(2 ** rng.uniform(0, 10))]
-        change = rng.integers(5)
-        if change == 0:
-            log[at] = rng.integers(256)
-        elif change == 1:
-            log[at] = rng.choice(list(b"0123456789.-+eE \n\t"))
-        elif change == 2 and len(piece) < len(log):
-            del log[at : at + len(piece)]
-        elif change == 3:
-            log[to:to] = piece
-        else:
-            log[to : to + len(piece)] = piece
-    return bytes(log)
-
-
-@pytest.fixture(scope="module")
-def healthy_log():
-    """Interleaved messages of every kind."""
-    rng = np.random.default_rng(1)
-    lines = ["PARAM robot_frontlaser_offset 0.1", "PARAM robot_front_laser_max 20.0"]
-    for t in range(12):
-        ranges = " ".join(f"{r:.2f}" for r in rng.uniform(0.5, 20.0, 9))
-        header = "0 -1.570796 3.141593 0.3926991 20.0 0.01 0"
-        pose, stamp = f"{t / 10:.3f} 0.0 0.01", f"{t / 5:.6f} host {t / 5:.6f}"
-        lines += [
-            f"ODOM {pose} 0 0 0 {stamp}",
-            f"FLASER 9 {ranges} {pose} {pose} {stamp}",
-            f"RAWLASER2 {header} 9 {ranges} 0 {stamp}",
-            f"ROBOTLASER1 {header} 9 {ranges} 0 {pose} {pose} 0 0 0 0 0 {stamp}",
-        ]
-    return "".join(f"{line}\n" for line in lines).encode()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(8))
-def test_mutations_of_a_recording(healthy_log, seed):
-    require_valid(healthy_log)
-    rng = np.random.default_rng(seed)
-    for _ in range(1000):
-        require_valid(mutated(healthy_log, rng))

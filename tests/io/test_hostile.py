@@ -125,24 +125,6 @@ def test_points_of_impossible_size(tmp_path, space):
         read(path)
 
 
-def test_packed_points_that_cannot_be(tmp_path, space):
-    pytest.importorskip("lazrs")
-    path = tmp_path / "a.laz"
-    writers.write(space, path)
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<I", content, 107, 2_000_000_000)
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="is truncated"):
-        read(path)
-
-
-def test_time_beyond_the_clock(tmp_path, space):
-    writers.write(space, tmp_path / "k", name="kitti")
-    times = ["1.0", "9999-12-31 23:59:59.9", "2.0", "3.0"]
-    (tmp_path / "k" / "times.txt").write_text("\n".join(times))
-    assert read(tmp_path / "k").stamp_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
-
-
 @pytest.mark.parametrize("blank", [b"\x1c", b"\x1f\x1f", b"\x85", b"\xa0"])
 def test_lines_that_only_numpy_takes_for_empty(tmp_path, blank):
     header = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"

@@ -1,8 +1,6 @@
 """KITTI: odometry sequences and raw drives, whole and damaged."""
 
 import os
-import runpy
-import sys
 
 import numpy as np
 import pytest
@@ -227,17 +225,3 @@ def test_times(tmp_path):
     last = "2116-02-20 23:53:38"
     file.write_text(f"1969-12-31 23:59:58.25\n{last}.5\n{last}.427387903\n")
     assert read_times(file) == [-1_750_000_000, None, 2**62 - 1]
-
-
-@pytest.mark.slow
-def test_a_pack_that_was_unpacked(shared_data, tmp_path, monkeypatch):
-    lidar = shared_data / "lidar3d"
-    pack = np.load(lidar / "queue_000-039.npz")
-    words = ["unpack.py", str(lidar / "queue_000-039.npz"), str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", words)
-    runpy.run_path(str(lidar / "unpack.py"), run_name="__main__")
-    found = read(tmp_path)
-    np.testing.assert_array_equal(found.offset, pack["offset"])
-    np.testing.assert_allclose(found.points, pack["xyz_2p5mm"] * 0.0025, atol=1e-5)
-    np.testing.assert_allclose(found.T_recorded_base, pack["pose"], atol=1e-7)
-    np.testing.assert_array_equal(found.stamp_ns, np.arange(40) * 10**8)

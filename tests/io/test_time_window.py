@@ -4,40 +4,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cut_recordings import PERIOD, START, N, make_recording
 
 from stillmap.core.errors import InputError
-from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io.ros import lasers
 from stillmap.prepare.options import ReadOptions
 
 FORMS_2D = {"carmen": ".clf", "bag": ".bag", "db3": ".db3", "mcap": ".mcap", "stillmap": ""}
 FORMS_3D = {"mcap": ".mcap", "kitti": "", "pcd": "", "stillmap": ""}
-T, N = 30, 8
-START = 1_600_000_000  # s
-PERIOD = 100_000_000  # ns
-
-
-def made_up(dimension: int) -> Recording:
-    rng = np.random.default_rng(3)
-    T_odom_base = np.tile(np.eye(dimension + 1), (T, 1, 1))
-    T_odom_base[:, 0, -1] = 0.01 * np.arange(T)
-    angle, length = np.linspace(-1.0, 1.0, N), rng.uniform(1.0, 9.0, (T, N)).round(2)
-    points = np.stack([length * np.cos(angle), length * np.sin(angle), 0 * length], axis=-1)
-    return Recording(
-        stamp_ns=START * 10**9 + PERIOD * np.arange(T, dtype=np.int64),
-        offset=np.arange(T + 1, dtype=np.int64) * N,
-        points=points[..., :dimension].reshape(-1, dimension).astype(np.float32),
-        hit=np.ones(T * N, np.bool_),
-        T_base_sensor=np.eye(dimension + 1)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=T_odom_base,
-    )
+T = 60
 
 
 def written(dimension: int, form: str, folder: Path) -> Path:
     ending = (FORMS_2D if dimension == 2 else FORMS_3D)[form]
-    writers.write(made_up(dimension), folder / f"made{ending}", name=form)
+    writers.write(make_recording(dimension), folder / f"made{ending}", name=form)
     return folder / f"made{ending}"
 
 
@@ -65,17 +46,17 @@ def test_a_part_holds_the_scans_between_its_limits(dimension, form, tmp_path):
             np.testing.assert_allclose(part.T_odom_base, whole.T_odom_base[rows], atol=1e-9)
         noted = part.source.part
         assert noted.omitted == T - part.n_scans
-        assert noted.last_stamp_ns - noted.first_stamp_ns == (T - 1) * PERIOD
+        assert noted.last_stamp_ns - noted.first_stamp_ns == (T - 1) * int(1e9 * PERIOD)
 
 
 @pytest.mark.parametrize(("dimension", "form"), CASES)
 def test_an_empty_part_names_the_span(dimension, form, tmp_path):
     path = written(dimension, form, tmp_path)
     for start, end in ((10.0, None), (0.31, 0.39), (1.0, 0.5), (None, START - 5.0)):
-        with pytest.raises(InputError, match=r"has no scan .*spans 0 to 2\.90 s") as caught:
+        with pytest.raises(InputError, match=r"has no scan .*spans 0 to 5\.90 s") as caught:
             read(path, ReadOptions(start=start, end=end))
         assert caught.value.where == str(path)
-        assert f"stamps {START}.000000000 to {START + 2}.900000000" in str(caught.value)
+        assert f"stamps {START}.000000000 to {START + 5}.900000000" in str(caught.value)
 
 
 @pytest.mark.parametrize("form", ["bag", "mcap"])
@@ -105,9 +86,3 @@ def test_a_second_sensor_may_begin_earlier(tmp_path):
     for start, count in ((None, 4), (0.0, 4), (0.9, 2), (1.0, 1)):
         assert read(path, ReadOptions(start=start)).n_scans == count
     assert read(path, ReadOptions(end=0.5)).n_scans == 2
-
-
-@pytest.mark.parametrize("changes", [{"start": -1.0}, {"end": -0.1}, {"start": 1e11}])
-def test_limits_that_cannot_be(changes):
-    with pytest.raises(ValueError, match=r"equal to (9000000000|0)"):
-        ReadOptions(**changes)

@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 from small_bags import FLOAT, UINT16, UINT32, cloud_message, write_bag
 
 from stillmap.io import read
 from stillmap.io.filter_writers import FilterJob, Omissions
+from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.filtered import write_filtered
 from stillmap.io.ros.messages import load_typestore
+from stillmap.io.ros.writer import _TRANSIENT_LOCAL
 from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
@@ -223,32 +229,7 @@ def test_clouds_in_another_kind_of_ros2_bag(bag, messages, kind, tmp_path):
 
 
 def test_publishers_and_quality_of_service_stay(tmp_path, kind, messages):
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
-
-    from stillmap.io.ros.bag import open_bag
-
-    never = QosTime(1, 2)
-    qos = Qos(
-        QosHistory.KEEP_LAST,
-        5,
-        QosReliability.BEST_EFFORT,
-        QosDurability.VOLATILE,
-        never,
-        never,
-        QosLiveliness.AUTOMATIC,
-        never,
-        False,
-    )
+    qos = _TRANSIENT_LOCAL._replace(depth=5, durability=QosDurability.VOLATILE)
     if kind == "bag":
         source, more = tmp_path / "a.bag", {"callerid": "/lidar"}
         writer = Writer1(source)

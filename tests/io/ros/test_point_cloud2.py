@@ -21,6 +21,10 @@ def xyz(rng, n=12):
     return rng.normal(size=(3, n)).astype(np.float32) * 5.0
 
 
+def columns_of(x, y, z, kind=FLOAT):
+    return [("x", kind, x), ("y", kind, y), ("z", kind, z)]
+
+
 @pytest.fixture
 def rng():
     return np.random.default_rng(5)
@@ -29,19 +33,13 @@ def rng():
 def test_fields_in_any_order_with_gaps(bag, messages, rng):
     x, y, z = xyz(rng)
     x[3] = np.nan
+    columns = columns_of(x, y, z)
     layouts = [
-        {"columns": [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]},
-        {
-            "columns": [
-                ("ring", UINT16, np.ones(12)),
-                ("z", FLOAT, z),
-                ("x", FLOAT, x),
-                ("y", FLOAT, y),
-            ]
-        },
-        {"columns": [("x", DOUBLE, x), ("y", DOUBLE, y), ("z", DOUBLE, z)], "step": 48},
-        {"columns": [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)], "height": 3, "padding": 7},
-        {"columns": [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)], "big": True},
+        {"columns": columns},
+        {"columns": [("ring", UINT16, np.ones(12)), columns[2], *columns[:2]]},
+        {"columns": columns_of(x, y, z, DOUBLE), "step": 48},
+        {"columns": columns, "height": 3, "padding": 7},
+        {"columns": columns, "big": True},
     ]
     content = [
         ("/points", START + k, cloud_message(messages, START + k, **layout))
@@ -69,15 +67,14 @@ def test_point_times(bag, messages, rng):
         ("offset_time", UINT32, np.round(after * 1e6)),
     ]
     for name, kind, values in times:
-        columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z), (name, kind, values)]
+        columns = [*columns_of(x, y, z), (name, kind, values)]
         content = [("/points", START, cloud_message(messages, START, columns))]
         recording = read(bag(content, f"{name}{kind}{values[-1]:.0f}"))
         np.testing.assert_allclose(recording.beam_time, after, atol=2e-6)
 
 
 def test_damaged_clouds_are_counted(bag, messages, rng):
-    x, y, z = xyz(rng)
-    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    columns = columns_of(*xyz(rng))
     odd = [
         {},
         {"width": 2**32 - 1},
@@ -98,8 +95,7 @@ def test_damaged_clouds_are_counted(bag, messages, rng):
 
 
 def test_extrinsics_and_odometry(bag, messages, rng):
-    x, y, z = xyz(rng)
-    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    columns = columns_of(*xyz(rng))
     mounts = [
         messages.transform(0, "base_link", "front", (1, 0, 0.5)),
         messages.transform(0, "base_link", "rear", (-1, 0, 0.5), (0, 0, 1, 0)),
@@ -120,8 +116,7 @@ def test_extrinsics_and_odometry(bag, messages, rng):
 
 
 def test_named_topics_are_used_together_or_refused(bag, messages, rng):
-    x, y, z = xyz(rng)
-    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    columns = columns_of(*xyz(rng))
     mount = messages.transform(0, "base_link", "front", (1, 0, 0.5))
     rear = messages.transform(0, "base_link", "rear", (-1, 0, 0.5))
     topics = {"/front": "front", "/rear": "rear", "/copy": "front", "/lost": "nowhere"}
@@ -156,8 +151,7 @@ def image_message(messages, stamp, pixels, encoding, row_bytes=None, **changes):
 
 
 def bag_with_images(messages, rng, image_messages):
-    x, y, z = xyz(rng)
-    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    columns = columns_of(*xyz(rng))
     mounts = [
         messages.transform(0, "lidar", "camera", (0.1, 0.2, 0.3), (-0.5, 0.5, -0.5, 0.5)),
     ]
@@ -174,23 +168,19 @@ def test_images_are_decoded_on_demand(bag, messages, rng):
     depth = rng.integers(0, 5000, (6, 4), np.uint16)
     stream = io.BytesIO()
     Image.fromarray(colours).save(stream, "PNG")
-    packed = messages.make(
-        "sensor_msgs/msg/CompressedImage",
-        messages.header(START + 4, "camera"),
-        "png",
-        np.frombuffer(stream.getvalue(), np.uint8),
-    )
+    kind, data = "sensor_msgs/msg/CompressedImage", np.frombuffer(stream.getvalue(), np.uint8)
+    packed = messages.make(kind, messages.header(START + 4, "camera"), "png", data)
+    shown = {
+        1: ("/cam/image", colours, "rgb8"),
+        2: ("/cam/image", colours[..., ::-1].copy(), "bgr8", 20),
+        3: ("/grey/image", grey, "mono8"),
+        5: ("/depth/image", depth, "16UC1"),
+    }
     image_messages = [
-        ("/cam/image", START + 1, image_message(messages, START + 1, colours, "rgb8")),
-        (
-            "/cam/image",
-            START + 2,
-            image_message(messages, START + 2, colours[..., ::-1].copy(), "bgr8", 20),
-        ),
-        ("/grey/image", START + 3, image_message(messages, START + 3, grey, "mono8")),
-        ("/other/image/compressed", START + 4, ("sensor_msgs/msg/CompressedImage", packed)),
-        ("/depth/image", START + 5, image_message(messages, START + 5, depth, "16UC1")),
+        (topic, START + k, image_message(messages, START + k, *what))
+        for k, (topic, *what) in shown.items()
     ]
+    image_messages.append(("/other/image/compressed", START + 4, (kind, packed)))
     images = read(bag(bag_with_images(messages, rng, image_messages))).images
     assert images is not None
     np.testing.assert_array_equal(images.stamp_ns, START + np.arange(1, 6))
@@ -211,47 +201,25 @@ def test_bayer(bag, messages, rng):
     np.testing.assert_array_equal(images.read(0), np.full((2, 2, 3), [10, 30, 30]))
 
 
-def test_camera_calibration(bag, messages, rng):
-    grey = rng.integers(0, 256, (6, 4), np.uint8)
-    kind = "sensor_msgs/msg/CameraInfo"
-    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    values = [
-        "plumb_bob",
-        np.arange(5.0),
-        np.array([9.0, 0, 2, 0, 9, 3, 0, 0, 1]),
-        np.eye(3).ravel(),
-    ]
-    info = messages.make(
-        kind, messages.header(START, "camera"), 6, 4, *values, np.zeros(12), 0, 0, region
-    )
-    image_messages = [
-        ("/cam/camera_info", START, (kind, info)),
-        ("/cam/image_raw", START + 1, image_message(messages, START + 1, grey, "mono8")),
-    ]
-    camera = read(bag(bag_with_images(messages, rng, image_messages))).images.cameras[0]
-    np.testing.assert_array_equal(camera.K, [[9, 0, 2], [0, 9, 3], [0, 0, 1]])
-    assert camera.model == "plumb_bob"
-    np.testing.assert_array_equal(camera.distortion, np.arange(5.0))
-
-
-@pytest.mark.parametrize("name", ["image_rect", "image_rect_color"])
-def test_rectified_images_use_the_projection_matrix(bag, messages, rng, name):
-    grey = rng.integers(0, 256, (6, 4), np.uint8)
-    kind = "sensor_msgs/msg/CameraInfo"
-    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    turn = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
-    raw = np.array([9.0, 0, 2, 0, 9, 3, 0, 0, 1])
+@pytest.mark.parametrize("name", ["image_raw", "image_rect", "image_rect_color"])
+def test_camera_calibration(bag, messages, rng, name):
+    """Rectified images use the projection matrix, and the rectified camera is rotated."""
+    kind, turn = "sensor_msgs/msg/CameraInfo", Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
+    K = np.array([9.0, 0, 2, 0, 9, 3, 0, 0, 1])
     P = np.array([8.0, 0, 2.5, -0.8, 0, 8, 3.5, 0, 0, 0, 1, 0])
-    values = ["plumb_bob", np.arange(5.0), raw, turn.ravel(), P, 0, 0, region]
+    values = ["plumb_bob", np.arange(5.0), K, turn.ravel(), P]
     info = messages.make(kind, messages.header(START, "camera"), 6, 4, *values)
-    image_messages = [
-        ("/cam/camera_info", START, (kind, info)),
-        (f"/cam/{name}", START + 1, image_message(messages, START + 1, grey, "mono8")),
-    ]
-    camera = read(bag(bag_with_images(messages, rng, image_messages))).images.cameras[0]
-    np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
-    assert (camera.model, len(camera.distortion)) == ("", 0)
-    # the rectified camera is rotated
+    image = image_message(messages, START + 1, np.zeros((6, 4), np.uint8), "mono8")
+    images = [("/cam/camera_info", START, (kind, info)), (f"/cam/{name}", START + 1, image)]
+    camera = read(bag(bag_with_images(messages, rng, images))).images.cameras[0]
     ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    if name == "image_raw":
+        np.testing.assert_array_equal(camera.K.ravel(), K)
+        np.testing.assert_array_equal(camera.distortion, np.arange(5.0))
+        assert camera.model == "plumb_bob"
+        turn = np.eye(3)
+    else:
+        np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
+        assert (camera.model, len(camera.distortion)) == ("", 0)
     np.testing.assert_allclose(camera.T_base_camera[:3, :3], ahead @ turn.T, atol=1e-12)
     np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.2, 0.3])

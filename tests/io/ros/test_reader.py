@@ -6,6 +6,7 @@ import pytest
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read
+from stillmap.pipeline import inputs
 from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
@@ -21,6 +22,11 @@ def turned(theta, over=0.0):
 
 def ranges_at(k, n=5):
     return 2.0 + 0.1 * k + 0.01 * np.arange(n)
+
+
+def scan_at(messages, k, ranges=None, **changes):
+    stamp, ranges = START + k * SECOND, ranges_at(k) if ranges is None else ranges
+    return "/scan", stamp, messages.scan(stamp, ranges, **changes)
 
 
 def drive(messages, n_scans=10, n_beams=5):
@@ -60,8 +66,7 @@ def test_a_drive(bag, messages):
 
 
 def test_no_transforms(bag, messages):
-    scans = [("/scan", START + k, messages.scan(START + k, ranges_at(k))) for k in range(3)]
-    recording = read(bag(scans))
+    recording = read(bag([scan_at(messages, k) for k in range(3)]))
     assert recording.T_odom_base is None
     np.testing.assert_array_equal(recording.T_base_sensor[0], np.eye(3))
     assert "is used as the base frame" in recording.source.warnings[0]
@@ -88,23 +93,14 @@ def test_odometry_messages(bag, messages):
 def test_infinity_means_no_return(bag, messages):
     """REP 117: +inf no return, -inf too near, NaN no measurement."""
     readings = [1.0, np.inf, -np.inf, np.nan, 0.05, -1.0, 15.0]
-    scans = [("/scan", START + k, messages.scan(START + k, readings)) for k in range(2)]
-    recording = read(bag(scans))
+    recording = read(bag([scan_at(messages, k, readings) for k in range(2)]))
     np.testing.assert_array_equal(recording.hit[:7], [1, 0, 0, 0, 0, 0, 1])
     length = np.linalg.norm(recording.points[:7], axis=1)
     np.testing.assert_allclose(length, [1.0, 15.0, np.nan, np.nan, np.nan, np.nan, 15.0], rtol=1e-6)
 
 
 def test_beam_times(bag, messages):
-    scans = [
-        (
-            "/scan",
-            START + k * SECOND,
-            messages.scan(START + k * SECOND, ranges_at(k), time_increment=0.01),
-        )
-        for k in range(3)
-    ]
-    recording = read(bag(scans))
+    recording = read(bag([scan_at(messages, k, time_increment=0.01) for k in range(3)]))
     np.testing.assert_allclose(recording.beam_time, np.tile(0.01 * np.arange(5), 3), rtol=1e-6)
 
 
@@ -112,7 +108,7 @@ def test_upside_down_laser(bag, messages):
     """Its angles rise to the right of the robot, seen from above."""
     over = messages.transform(0, "base_link", "laser", (0.1, 0.2, 0.3), turned(0.3, np.pi))
     content = [("/tf_static", START, messages.tf(over))]
-    content += [("/scan", START + k, messages.scan(START + k, ranges_at(k))) for k in range(2)]
+    content += [scan_at(messages, k) for k in range(2)]
     recording = read(bag(content))
     np.testing.assert_allclose(
         se2.parameters(recording.T_base_sensor), [[0.1, 0.2, 0.3]], atol=1e-9
@@ -123,16 +119,11 @@ def test_upside_down_laser(bag, messages):
 
 
 def test_two_lasers_interleave(bag, messages):
-    content = [
-        (
-            "/tf_static",
-            START,
-            messages.tf(
-                messages.transform(0, "base_link", "front", (0.3, 0, 0)),
-                messages.transform(0, "base_link", "rear", (-0.3, 0, 0), turned(np.pi)),
-            ),
-        )
+    mounts = [
+        messages.transform(0, "base_link", "front", (0.3, 0, 0)),
+        messages.transform(0, "base_link", "rear", (-0.3, 0, 0), turned(np.pi)),
     ]
+    content = [("/tf_static", START, messages.tf(*mounts))]
     for k in range(6):
         front, rear = START + k * SECOND, START + k * SECOND + SECOND // 3
         content.append(("/front", front, messages.scan(front, ranges_at(k), "front")))
@@ -150,26 +141,36 @@ def test_two_lasers_interleave(bag, messages):
     )
 
 
-def test_unconnected_lasers(bag, messages):
+@pytest.mark.parametrize(
+    ("frame", "why"),
+    [
+        ("laser", "/b: 6 scans, /a shows the same sensor"),
+        ("other", "no transform connects 'other'"),
+    ],
+)
+def test_lasers_that_are_left_out(bag, messages, frame, why):
     content = []
     for k in range(6):
         stamp = START + k * SECOND
-        content.append(("/a", stamp, messages.scan(stamp, ranges_at(k), "one")))
-        content.append(("/b", stamp, messages.scan(stamp, ranges_at(k), "other")))
+        content.append(("/a", stamp, messages.scan(stamp, ranges_at(k))))
+        content.append(("/b", stamp, messages.scan(stamp, ranges_at(k), frame)))
     recording = read(bag(content))
-    assert recording.n_scans == 6
-    assert "no transform connects 'other'" in recording.source.duplicates[0]
+    assert [s.name for s in recording.source.sensors] == ["/a"]
+    assert why in recording.source.duplicates[0]
 
 
-def test_duplicate_topics_are_dropped(bag, messages):
-    content = []
-    for k in range(6):
-        stamp = START + k * SECOND
-        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
-        content.append(("/scan_filtered", stamp, messages.scan(stamp, ranges_at(k))))
-    recording = read(bag(content))
-    assert [s.name for s in recording.source.sensors] == ["/scan"]
-    assert recording.source.duplicates == ["/scan_filtered: 6 scans, /scan shows the same sensor"]
+def test_a_split_bag_is_the_whole_one(bag, messages):
+    """Static transforms are in the first part alone."""
+    content = drive(messages, 40)
+    whole = read(bag(content))
+    spans = ((0, 45), (45, 80), (80, None))
+    paths = [str(bag(content[slice(*span)], f"part_{k}")) for k, span in enumerate(spans)]
+    joined = inputs.read(paths[::-1])
+    for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "T_odom_base", "sensor"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name), err_msg=name)
+    assert joined.source.base_frame == "base_link"
+    assert sum(one.scans for one in joined.source.parts) == 40
+    assert joined.source.warnings == whole.source.warnings
 
 
 def test_moving_laser(bag, messages):
@@ -219,18 +220,13 @@ def test_missing_topics(bag, messages):
 
 
 def test_echoes(bag, messages):
-    echo = messages.store.types["sensor_msgs/msg/LaserEcho"]
-    kind = "sensor_msgs/msg/MultiEchoLaserScan"
-    content = []
+    kind, angles = "sensor_msgs/msg/MultiEchoLaserScan", (-0.5, 0.5, 0.25)
+    lists = ([1.0, 3.0], [], [2.0], [np.inf], [4.0, 5.0])
+    echoes = [{"echoes": np.array(e, np.float32)} for e in lists]
+    limits, content = {"range_min": 0.1, "range_max": 20.0}, []
     for k in range(2):
-        echoes = [np.array(e, np.float32) for e in ([1.0, 3.0], [], [2.0], [np.inf], [4.0, 5.0])]
-        scan = messages.make(
-            kind,
-            messages.header(START + k, "laser"),
-            *(-0.5, 0.5, 0.25, 0.0, 0.0, 0.1, 20.0),
-            [echo(e) for e in echoes],
-            [],
-        )
+        header = messages.header(START + k, "laser")
+        scan = messages.make(kind, header, *angles, ranges=echoes, **limits)
         content.append(("/echoes", START + k, (kind, scan)))
     recording = read(bag(content))
     length = np.linalg.norm(recording.points[:5], axis=1)
