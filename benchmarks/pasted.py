@@ -20,7 +20,7 @@ import stillmap
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
 from stillmap.io import rgbd
-from stillmap.io.images import read_image
+from stillmap.io.cameras import read_image
 from stillmap.io.rgbd import list_frames
 from stillmap.prepare.options import ReadOptions
 

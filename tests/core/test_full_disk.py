@@ -8,7 +8,7 @@ import pytest
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.files import write_text
 from stillmap.core.json import write_json
-from stillmap.io.images import write_png
+from stillmap.io.cameras import write_png
 
 ARRAY = np.random.default_rng(0).integers(0, 255, (50, 50)).astype(np.uint8)
 

@@ -9,12 +9,12 @@ from peak_memory import run_measured
 from PIL import Image
 
 from stillmap.core.errors import InputError
-from stillmap.io.images import read_image, read_image_size
+from stillmap.io.cameras import read_image, read_image_size
 
 READ = """
 import sys
 from pathlib import Path
-from stillmap.io.images import read_image
+from stillmap.io.cameras import read_image
 read_image(Path(sys.argv[1]))
 """
 
@@ -83,7 +83,7 @@ def test_images_are_unpacked_some_rows_at_a_time(mode, tmp_path, monkeypatch):
     image = Image.fromarray(grey.astype(np.uint16) if mode == "I;16" else grey)
     path = tmp_path / "a.tif"
     image.convert(mode).save(path)
-    monkeypatch.setattr("stillmap.io.images._UNPACKED", 100)
+    monkeypatch.setattr("stillmap.io.cameras._UNPACKED", 100)
     whole = np.array(image.convert("1") if mode == "1" else image)
     expected = whole if mode in ("L", "I;16", "I", "F") else np.repeat(whole[..., None], 3, axis=2)
     np.testing.assert_array_equal(

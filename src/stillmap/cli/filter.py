@@ -160,7 +160,7 @@ def _write_filtered(
         InputError: labels and recording cannot be read, or do not belong together.
     """
     from stillmap.core.files import workplace
-    from stillmap.io.filter_writers import FilterJob
+    from stillmap.io.filtered_clouds import FilterJob
 
     scratch = workplace(output)
     with show_share(args.quiet, "reading") as progress:

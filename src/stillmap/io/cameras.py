@@ -1,33 +1,34 @@
-"""Images and camera calibrations of a recording, overridden or added by `--cameras FILE`.
+"""Images, and camera calibrations of a recording, overridden or added by `--cameras FILE`.
 
-The file is TOML, one table per camera:
+Image files are read and written with Pillow. The camera file is TOML, one table per camera:
 
 ["/front/image_raw"]             # topic or folder, named as in `stillmap info`
-fx = 525.0
-fy = 525.0
-cx = 319.5
-cy = 239.5
+fx = 525.0                       # and fy, cx, cy; or K = [[...], [...], [...]]
 model = "plumb_bob"
 distortion = [0.26, -0.95, -0.005, 0.003, 1.16]
 translation = [0.2, 0.0, 0.5]    # of T_base_camera; camera axes: x right, y down, z ahead
 quaternion = [-0.5, 0.5, -0.5, 0.5]
 """
 
-from collections.abc import Mapping, Sequence
+import io
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from stillmap.core.camera import Camera, Images
 from stillmap.core.config import STRICT, load_toml, override
 from stillmap.core.errors import InputError, closest_match
+from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
-from stillmap.io.images import EXTENSIONS, read_image, read_image_size
 from stillmap.io.text_lines import (
     list_files,
     read_times,
@@ -315,3 +316,87 @@ def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) ->
     width, height = read_image_size(used[0][1])
     camera = given.apply_to(Camera(name, width, height, None, "", np.zeros(0), None))
     return images_from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)
+
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
+# whatever the name: for EPS, Pillow starts Ghostscript
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
+
+# of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes 1 to 4
+_MAX_PIXELS = 64 << 20
+_UNPACKED = 1 << 20  # pixels of an image that become an array at a time
+
+_DAMAGED = (OSError, ValueError, SyntaxError, EOFError, MemoryError)
+_TOO_LARGE = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+_DTYPES: dict[str, Any] = {  # by Pillow's mode; others become RGB
+    **{"L": np.uint8, "F": np.float32},
+    **dict.fromkeys(("I;16", "I;16B", "I;16L", "I;16N", "I"), np.uint16),
+}
+
+
+def read_image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels, from the header alone.
+
+    Raises:
+        InputError: it is no image, or cannot be read.
+    """
+    with _open_image(path) as image:
+        return int(image.size[0]), int(image.size[1])
+
+
+def read_image(path: Path) -> NDArray[Any]:
+    """The array of an image file, see `Images.read`.
+
+    Raises:
+        InputError: it is no image, damaged, or cannot be read.
+    """
+    with _open_image(path) as image:
+        return to_array(image)
+
+
+def to_array(image: Image.Image) -> NDArray[Any]:
+    """The array of an image, some rows at a time: at once it takes twice the memory."""
+    dtype, (width, height) = _DTYPES.get(image.mode), image.size
+    shape = (height, width) if dtype else (height, width, 3)
+    out = np.empty(shape, dtype or np.uint8)
+    rows = max(_UNPACKED // max(width, 1), 1)
+    for first in range(0, height, rows):
+        part = image.crop((0, first, width, min(first + rows, height)))
+        out[first : first + rows] = part if dtype else part.convert("RGB")
+    return out
+
+
+def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
+    """Write an integer image as PNG; see `read_image` for its shape and type.
+
+    Higher levels than 1 take ten times as long.
+    """
+    buffer = io.BytesIO()  # Pillow does not notice that a disk is full
+    Image.fromarray(image).save(buffer, format="PNG", compress_level=compress_level)
+    path.write_bytes(buffer.getbuffer())
+
+
+@contextmanager
+def _open_image(path: Path) -> Iterator[Image.Image]:
+    try:
+        if not path.is_file():
+            what = "is no file" if path.exists() else "is listed, but not there"
+            raise InputError(what, where=str(path))
+        with warnings.catch_warnings():
+            # an image that unpacks to more than memory
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            warnings.filterwarnings("ignore", category=UserWarning)
+            # given a path, Pillow maps files of bare pixels into memory
+            with InputFile(path) as file, Image.open(file, formats=_FORMATS) as image:
+                if image.size[0] * image.size[1] > _MAX_PIXELS:
+                    raise InputError("is too large an image", where=str(path))
+                yield image
+    except (*_DAMAGED, *_TOO_LARGE) as error:
+        what = f"is no image: {error or 'it does not fit into memory'}"  # a length in its header
+        if isinstance(error, OSError) and error.strerror:
+            what = f"cannot be read: {error.strerror}"
+        elif isinstance(error, _TOO_LARGE):
+            what = "is too large an image"
+        elif isinstance(error, UnidentifiedImageError):
+            what = "is no image"
+        raise InputError(what, where=str(path)) from error

@@ -5,13 +5,12 @@ of `writers.py`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.arrays import ArrayBuilder
@@ -19,79 +18,17 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
+from stillmap.io.filtered_clouds import (
+    FilterJob,
+    Mask,
+    Omissions,
+    write_kitti,
+    write_las,
+    write_pcd,
+    write_ply,
+)
 from stillmap.io.registry import FORMATS, detect_format, load_later
 from stillmap.io.ros.messages import detect_kind
-from stillmap.io.text_lines import Progress
-from stillmap.prepare.options import ReadOptions
-
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class FilterJob:
-    """A recording to be written again, in its own format, with some beams blanked.
-
-    Attributes:
-        source: the file or folder that was read.
-        output: the copy; it appears complete or not at all.
-        recording: as it was read from `source`.
-        blank: (M,) beams to blank.
-        options: with which it was read.
-        marker: pattern of a file that every folder of the format holds; "": unused, for files.
-        overwrite: replace what is there.
-        omit: folders inside `source` that are not copied.
-        progress: called with the share of the copy that is written, 0 to 1.
-        kind: of the bag to write, as `writers.py` names it; "": that of the source, or no bag.
-    """
-
-    source: Path
-    output: Path
-    recording: Recording
-    blank: Mask
-    options: ReadOptions
-    marker: str = ""
-    overwrite: bool = False
-    omit: tuple[Path, ...] = ()
-    progress: Progress | None = None
-    kind: str = ""
-
-    def scan_masks(self, count: int) -> list[Mask | None]:
-        """(n,) beams to blank of the scan of each of `count` records; None: it was not read.
-
-        Raises:
-            InputError: `source` has other records than were read.
-        """
-        record = self.recording.record
-        if record is None or not ((record >= 0) & (record < count)).all():
-            raise other_recording_error(self.source)
-        masks: list[Mask | None] = [None] * count
-        for scan, number in enumerate(record.tolist()):
-            masks[number] = self.blank[self.recording.beams_of(scan)]
-        return masks
-
-    def report(self, share: float) -> None:
-        """Report progress, and release the pages of labels on the way."""
-        arrays.release_pages(self.blank)
-        if self.progress is not None:
-            self.progress(share)
-
-
-class Omissions(NamedTuple):
-    """The parts of a recording that a filtered copy lacks.
-
-    Attributes:
-        scans: number of scans left out, since nothing is known of their beams.
-        notes: on what else is left out or not filtered, a sentence each.
-    """
-
-    scans: int = 0
-    notes: tuple[str, ...] = ()
-
-
-def other_recording_error(path: Path) -> InputError:
-    """The error for a file or folder that has changed since it was read."""
-    return InputError("is not the recording that was mapped: other scans", where=str(path))
-
 
 Write = Callable[[FilterJob], Omissions]
 
@@ -132,16 +69,15 @@ def _write_stillmap(job: FilterJob) -> Omissions:
     return Omissions()
 
 
-_CLOUDS = "filtered_clouds"
 # by format: its name in `writers.py`, pattern of a file that every such folder holds, writer
 _OWN: dict[str, tuple[str, str, Write]] = {
     "stillmap recording": ("stillmap", stillmap_folder.HEADER, _write_stillmap),
     "ROS bag": ("", "metadata.yaml", load_later("ros.filtered", "write_filtered")),
     "CARMEN log": ("carmen", "", load_later("carmen.writer", "write_filtered")),
-    "KITTI folder": ("kitti", "velodyne*", load_later(_CLOUDS, "write_kitti")),
-    "PCD": ("pcd", "*.[pP][cC][dD]", load_later(_CLOUDS, "write_pcd")),
-    "PLY": ("ply", "*.[pP][lL][yY]", load_later(_CLOUDS, "write_ply")),
-    "LAS": ("las", "*.[lL][aA][sSzZ]", load_later(_CLOUDS, "write_las")),
+    "KITTI folder": ("kitti", "velodyne*", write_kitti),
+    "PCD": ("pcd", "*.[pP][cC][dD]", write_pcd),
+    "PLY": ("ply", "*.[pP][lL][yY]", write_ply),
+    "LAS": ("las", "*.[lL][aA][sSzZ]", write_las),
 }
 
 

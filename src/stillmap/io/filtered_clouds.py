@@ -1,26 +1,98 @@
-"""Filtered copies of KITTI folders and of PCD, PLY, LAS and LAZ files: points removed, in the
-encoding that they have, all else as it was."""
+"""Filtered copies: their job, and those of KITTI folders and of PCD, PLY, LAS and LAZ files: points
+removed, in the encoding that they have, all else as it was."""
 
 import os
 import re
 import shutil
 import struct
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import release_pages
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, atomic_folder
 from stillmap.core.input_files import InputFile, copy_file
-from stillmap.io.filter_writers import FilterJob, Mask, Omissions, other_recording_error
+from stillmap.core.recording import Recording
 from stillmap.io.point_cloud import kitti, las, pcd, ply, table
 from stillmap.io.point_cloud.clouds import files_of
 from stillmap.io.point_cloud.table import TableLayout
-from stillmap.io.text_lines import replace_words
+from stillmap.io.text_lines import Progress, replace_words
+from stillmap.prepare.options import ReadOptions
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterJob:
+    """A recording to be written again, in its own format, with some beams blanked.
+
+    Attributes:
+        source: the file or folder that was read.
+        output: the copy; it appears complete or not at all.
+        recording: as it was read from `source`.
+        blank: (M,) beams to blank.
+        options: with which it was read.
+        marker: pattern of a file that every folder of the format holds; "": unused, for files.
+        overwrite: replace what is there.
+        omit: folders inside `source` that are not copied.
+        progress: called with the share of the copy that is written, 0 to 1.
+        kind: of the bag to write, as `writers.py` names it; "": that of the source, or no bag.
+    """
+
+    source: Path
+    output: Path
+    recording: Recording
+    blank: Mask
+    options: ReadOptions
+    marker: str = ""
+    overwrite: bool = False
+    omit: tuple[Path, ...] = ()
+    progress: Progress | None = None
+    kind: str = ""
+
+    def scan_masks(self, count: int) -> list[Mask | None]:
+        """(n,) beams to blank of the scan of each of `count` records; None: it was not read.
+
+        Raises:
+            InputError: `source` has other records than were read.
+        """
+        record = self.recording.record
+        if record is None or not ((record >= 0) & (record < count)).all():
+            raise other_recording_error(self.source)
+        masks: list[Mask | None] = [None] * count
+        for scan, number in enumerate(record.tolist()):
+            masks[number] = self.blank[self.recording.beams_of(scan)]
+        return masks
+
+    def report(self, share: float) -> None:
+        """Report progress, and release the pages of labels on the way."""
+        release_pages(self.blank)
+        if self.progress is not None:
+            self.progress(share)
+
+
+class Omissions(NamedTuple):
+    """The parts of a recording that a filtered copy lacks.
+
+    Attributes:
+        scans: number of scans left out, since nothing is known of their beams.
+        notes: on what else is left out or not filtered, a sentence each.
+    """
+
+    scans: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def other_recording_error(path: Path) -> InputError:
+    """The error for a file or folder that has changed since it was read."""
+    return InputError("is not the recording that was mapped: other scans", where=str(path))
+
 
 _BLOCK_BYTES = 8 << 20  # of points copied at once
 _LABEL = 4  # bytes of a label of SemanticKITTI

@@ -28,8 +28,7 @@ from stillmap.core.source import SensorNotes, Source
 from stillmap.core.timestamps import parse_ns
 from stillmap.io import cameras
 from stillmap.io.builder import ReadContext
-from stillmap.io.cameras import CameraOverride
-from stillmap.io.images import read_image, read_image_size
+from stillmap.io.cameras import CameraOverride, read_image, read_image_size
 from stillmap.io.point_cloud.clouds import Cloud, CloudSource, build_recording, reject
 from stillmap.io.rgbd_calibration import calibrate_color_camera
 from stillmap.io.text_lines import read_lines

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
 from stillmap.core.errors import InputError
-from stillmap.io import images
+from stillmap.io import cameras
 
 Float = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ def _find_edges(K: Float, scale: float, pairs: Sequence[tuple[Path, Path]]) -> l
     out = []
     for pair in chosen.tolist():
         try:
-            depth, color = (images.read_image(file) for file in pairs[pair])
+            depth, color = (cameras.read_image(file) for file in pairs[pair])
         except InputError:
             continue
         is_pair = depth.dtype == np.uint16 and depth.ndim == 2 and color.shape[:2] == depth.shape

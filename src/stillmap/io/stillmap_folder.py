@@ -28,7 +28,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
-from stillmap.io.images import read_image, write_png
+from stillmap.io.cameras import read_image, write_png
 from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.options import MAX_POINT_DISTANCE
 

@@ -12,7 +12,7 @@ from stillmap.core.arrays import write_npz
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import Layer, TiledArray, compact, rows_of
 from stillmap.em import Coverage, OccupancyMap
-from stillmap.io.images import write_png
+from stillmap.io.cameras import write_png
 from stillmap.mapping import Change
 from stillmap.pipeline.options import MapMode
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH

@@ -13,7 +13,7 @@ from stillmap.core.array_types import Bool, Float, Float32, Int32, Int64
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json, write_json
-from stillmap.io.images import read_image, write_png
+from stillmap.io.cameras import read_image, write_png
 from stillmap.io.trajectory import write_tum
 from stillmap.sim.geometry import Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
 

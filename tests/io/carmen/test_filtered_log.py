@@ -8,7 +8,7 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.carmen.writer import find_no_return_code, write_filtered
-from stillmap.io.filter_writers import FilterJob
+from stillmap.io.filtered_clouds import FilterJob
 from stillmap.prepare.max_range import RangeRule
 from stillmap.prepare.options import ReadOptions
 

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from small_bags import FLOAT, UINT16, UINT32, cloud_message, write_bag
 
 from stillmap.io import read
-from stillmap.io.filter_writers import FilterJob, Omissions
+from stillmap.io.filtered_clouds import FilterJob, Omissions
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.filtered import write_filtered
 from stillmap.io.ros.messages import load_typestore

@@ -23,7 +23,7 @@ from stillmap.io.carmen.log import (
     read_log,
 )
 from stillmap.io.carmen.reader import is_stated_by_lines, select_scans
-from stillmap.io.filter_writers import FilterJob, Omissions, other_recording_error
+from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
 from stillmap.io.text_lines import read_lines, replace_words, write_atomically
 from stillmap.prepare.max_range import MIN_ZERO_SHARE, find_max_range
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE

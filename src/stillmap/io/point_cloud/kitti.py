@@ -18,7 +18,7 @@ from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.core.timestamps import format_seconds
-from stillmap.io import cameras, images
+from stillmap.io import cameras
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
 from stillmap.io.point_cloud.clouds import (
@@ -288,7 +288,7 @@ def _find_images(
 def _list_images(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
     """Stamps and files of the images of one camera."""
     inner = place / "data" if (place / "data").is_dir() else place
-    files = list_files(inner, images.EXTENSIONS)
+    files = list_files(inner, cameras.EXTENSIONS)
     own = place / "timestamps.txt"
     times = read_times(own) if own.is_file() else times
     return stamp_files(files, times, place)
@@ -303,7 +303,7 @@ def _make_camera(
     """
     if not files:
         raise InputError("there are none")
-    width, height = images.read_image_size(files[0][1])
+    width, height = cameras.read_image_size(files[0][1])
     P, T_camera_laser = calibration.projection.get(number), calibration.T_camera_laser
     K, T_laser_camera = None if P is None else P[:, :3].copy(), None
     if P is not None and T_camera_laser is not None:

@@ -27,6 +27,7 @@ from stillmap.io.ros.messages import (
     is_compressed,
     storage_files,
 )
+from stillmap.io.ros.recovery import DamagedBag, is_log_time
 
 _MAX_METADATA = 256 << 10  # bytes of YAML, which take two seconds to parse
 _MAX_QOS_TEXT = 16 << 10  # bytes of YAML: a megabyte takes rosbags half a minute
@@ -110,7 +111,7 @@ class IndexedBag:
                 raise
             except Exception as error:  # any error of rosbags about damaged bytes
                 raise DamagedBagError(str(error) or type(error).__name__) from error
-            if not (limits.is_log_time(log_ns) and isinstance(raw, bytes)):
+            if not (is_log_time(log_ns) and isinstance(raw, bytes)):
                 raise DamagedBagError("a message without time or content")
             yield Message(channels[connection.id], log_ns, raw)
 
@@ -233,11 +234,7 @@ def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
     for magic, (kind, open_indexed) in _STORAGES.items():
         if start.startswith(magic):
             try:
-                return (
-                    IndexedBag(kind, open_indexed(path))
-                    if trusted
-                    else limits.DamagedBag(kind, path)
-                )
+                return IndexedBag(kind, open_indexed(path)) if trusted else DamagedBag(kind, path)
             except InputError as error:
                 raise InputError(error.what, where=str(path), hint=error.hint) from error
             except PermissionError as error:

@@ -8,7 +8,7 @@ import numpy as np
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
-from stillmap.io.filter_writers import FilterJob, Mask, Omissions, other_recording_error
+from stillmap.io.filtered_clouds import FilterJob, Mask, Omissions, other_recording_error
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import (

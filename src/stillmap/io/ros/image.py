@@ -14,7 +14,7 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.images import to_array
+from stillmap.io.cameras import to_array
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,

@@ -206,6 +206,20 @@ def _digest(encoding: str, kind: str) -> str:
     return store.generate_msgdef(kind)[1] if encoding == "ros1" else store.hash_rihs01(kind)
 
 
+def hash_definition(channel: Channel) -> str:
+    """The hash of a ROS 2 type from its definition; "" where that is missing or invalid."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if channel.encoding == "ros1" or not channel.definition:
+        return ""
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(channel.definition, channel.type))
+        return store.hash_rihs01(channel.type)
+    except Exception:  # any error of rosbags about a text that is no definition
+        return ""
+
+
 def stamp_ns(header: Any) -> int:
     """The stamp of a header in nanoseconds."""
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags import interfaces, rosbag1, rosbag2
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
@@ -26,6 +25,7 @@ from stillmap.io.ros.messages import (
     TF,
     BagKind,
     Channel,
+    hash_definition,
     load_typestore,
 )
 
@@ -71,10 +71,7 @@ class BagWriter:
     def add_topic(self, name: str, type: str, *, latched: bool = False) -> Send:
         """Add a topic; returns a function that writes a message at a stamp in nanoseconds.
 
-        Args:
-            name: with its slash.
-            type: as `sensor_msgs/msg/LaserScan`.
-            latched: late subscribers still get the last message.
+        Late subscribers still get the last message of a `latched` one.
         """
         connection = self._add_connection(name, type, latched, typestore=self._store)
 
@@ -90,16 +87,15 @@ class BagWriter:
         None where the definition of its type is not known.
         """
         options: dict[str, Any] = {"typestore": self._store}
-        digest = channel.digest or _digest(channel)
+        digest = channel.digest or hash_definition(channel)
         if channel.definition and digest:
             hash_name = "md5sum" if self.is_ros1 else "rihs01"
             options = {"msgdef": channel.definition, hash_name: digest}
         elif channel.type not in self._store.fielddefs:
             return None
-        if self.is_ros1 and channel.publisher:
-            options["callerid"] = channel.publisher
-        if not self.is_ros1 and channel.qos:
-            options["offered_qos_profiles"] = list(channel.qos)
+        origin = {"callerid": channel.publisher} if self.is_ros1 else {}
+        origin = origin or {"offered_qos_profiles": list(channel.qos)}
+        options |= {name: value for name, value in origin.items() if value}
         writer = self._writer
         connection = self._add_connection(channel.topic, channel.type, channel.latched, **options)
         return lambda stamp, raw: writer.write(connection, stamp, raw)
@@ -133,18 +129,6 @@ def _make_field(store: Typestore, kind: Any, given: Any) -> Any:
     if item == Nodetype.NAME:
         return [_make_field(store, (item, name), part) for part in given or ()]
     return np.zeros(count, name[0]) if given is None else given
-
-
-def _digest(channel: Channel) -> str:
-    """The hash of a ROS 2 type from its definition; "" where that is missing or invalid."""
-    if channel.encoding == "ros1" or not channel.definition:
-        return ""
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(get_types_from_msg(channel.definition, channel.type))
-        return store.hash_rihs01(channel.type)
-    except Exception:  # any error of rosbags about a text that is no definition
-        return ""
 
 
 @contextmanager
