@@ -59,10 +59,8 @@ _Path = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 class CameraOverride:
     """Values of one camera; None: not given. See the beginning of this file.
 
-    Attributes:
-        time_offset: seconds added to the stamps of its images.
-        folder: of images outside the recording, seen from the file.
-        times: file with their stamps; None: from their names.
+    `time_offset` (s) is added to the stamps of its images; `folder` holds images outside the
+    recording, `times` their stamps, else their names do.
     """
 
     K: _Matrix | None = None

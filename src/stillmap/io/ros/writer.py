@@ -30,9 +30,7 @@ from stillmap.io.ros.messages import (
 )
 
 Float = NDArray[np.float64]
-# of a message, by name: those that are zero or empty may be missing, those that a kind of bag does
-# not have are left out
-Fields = dict[str, Any]
+Fields = dict[str, Any]  # of a message: missing ones are zero, those it does not have left out
 Send = Callable[[int, Fields], None]  # stamp in ns, message
 SendRaw = Callable[[int, bytes], None]
 
@@ -93,9 +91,10 @@ class BagWriter:
             options = {"msgdef": channel.definition, hash_name: digest}
         elif channel.type not in self._store.fielddefs:
             return None
-        origin = {"callerid": channel.publisher} if self.is_ros1 else {}
-        origin = origin or {"offered_qos_profiles": list(channel.qos)}
-        options |= {name: value for name, value in origin.items() if value}
+        if self.is_ros1:
+            options |= {"callerid": channel.publisher} if channel.publisher else {}
+        elif channel.qos:
+            options["offered_qos_profiles"] = list(channel.qos)
         writer = self._writer
         connection = self._add_connection(channel.topic, channel.type, channel.latched, **options)
         return lambda stamp, raw: writer.write(connection, stamp, raw)
@@ -354,10 +353,9 @@ class LaserScanEncoder:
 def write_sensor_frames(
     bag: BagWriter, recording: Recording, more: Sequence[tuple[str, str, Float]] = ()
 ) -> list[str]:
-    """Write the sensors' extrinsics to /tf_static, and more transforms (parent, child, T); returns
-    their S frames."""
-    S = len(recording.T_base_sensor)
-    frames = number_names("laser" if recording.dimension == 2 else "lidar", S)
+    """Write the sensors' extrinsics to /tf_static, and more transforms; returns their S frames."""
+    name = "laser" if recording.dimension == 2 else "lidar"
+    frames = number_names(name, len(recording.T_base_sensor))
     send = bag.add_topic("/tf_static", TF, latched=True)
     if recording.n_scans:
         first = int(recording.stamp_ns[0])
