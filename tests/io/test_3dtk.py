@@ -64,11 +64,7 @@ def test_damage(tmp_path):
     found = read(tmp_path)
     assert found.n_scans == 1
     skipped = {reason: damage.lines for reason, damage in found.source.skipped.items()}
-    assert skipped == {
-        "is damaged": [2, 3, 5, 7],
-        "is empty": [4],
-        "is truncated": [6],
-    }
+    assert skipped == {"is damaged": [2, 3, 5, 7], "is empty": [4], "is truncated": [6]}
     with pytest.raises(InputError, match=r"scan002\.3d: is damaged.*x"):
         read(tmp_path / "scan002.3d")
 

@@ -1,7 +1,6 @@
 """Builds a recording scan by scan, of any size, and counts the records that were skipped."""
 
 from array import array
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -174,35 +173,29 @@ _MAX_LOSS = 0.05  # share of scans that may be skipped without a warning
 
 
 class SkippedRecords:
-    """Counts skipped records by reason, with up to `MAX_LINE_NUMBERS` line numbers each."""
+    """Skipped records by reason: their numbers, of lines or messages."""
 
     def __init__(self) -> None:
-        self._count: Counter[str] = Counter()
-        self._lines: dict[str, list[int]] = {}
+        self._numbers: dict[str, array[int]] = {}
 
-    def add(self, reason: str, line: int) -> None:
-        self.add_all(reason, (line,))
+    def add(self, reason: str, number: int) -> None:
+        self.add_all(reason, (number,))
 
-    def add_all(self, reason: str, lines: Iterable[int]) -> None:
-        for line in lines:
-            self._count[reason] += 1
-            kept = self._lines.setdefault(reason, [])
-            if len(kept) < MAX_LINE_NUMBERS:
-                kept.append(int(line))
+    def add_all(self, reason: str, numbers: Iterable[int]) -> None:
+        for number in numbers:
+            self._numbers.setdefault(reason, array("q")).append(number)
 
     def merge(self, *others: "SkippedRecords") -> "SkippedRecords":
         """The sum of these and others; neither is changed."""
         out = SkippedRecords()
         for part in (self, *others):
-            for reason, count in part._count.items():
-                out._count[reason] += count
-                lines = sorted(out._lines.get(reason, []) + part._lines[reason])
-                out._lines[reason] = lines[:MAX_LINE_NUMBERS]
+            for reason, numbers in part._numbers.items():
+                out.add_all(reason, numbers)
         return out
 
     @property
     def total(self) -> int:
-        return self._count.total()
+        return sum(map(len, self._numbers.values()))
 
     def summary(self, unit: str = "line") -> str:
         """`3 x unreadable number (line 4, 8, 15)`, the most frequent reason first.
@@ -211,9 +204,9 @@ class SkippedRecords:
             unit: of the numbers.
         """
         parts = []
-        for reason, count in self._count.most_common():
-            shown = ", ".join(str(line) for line in sorted(self._lines[reason])[:3])
-            parts.append(f"{count} x {reason} ({unit} {shown}{', ...' if count > 3 else ''})")
+        for reason, numbers in sorted(self._numbers.items(), key=lambda item: -len(item[1])):
+            shown = ", ".join(map(str, sorted(numbers)[:3])) + ", ..." * (len(numbers) > 3)
+            parts.append(f"{len(numbers)} x {reason} ({unit} {shown})")
         return "; ".join(parts)
 
     def loss_warnings(self, kept: int, unit: str = "line") -> list[str]:
@@ -229,8 +222,8 @@ class SkippedRecords:
         ]
 
     def by_reason(self) -> dict[str, Skipped]:
-        """As `Recording.source` notes them."""
+        """As `Recording.source` notes them, with the first `MAX_LINE_NUMBERS` numbers each."""
         return {
-            reason: Skipped(count, sorted(self._lines[reason]))
-            for reason, count in self._count.items()
+            reason: Skipped(len(numbers), sorted(numbers)[:MAX_LINE_NUMBERS])
+            for reason, numbers in self._numbers.items()
         }

@@ -36,11 +36,7 @@ from stillmap.io.text_lines import (
     stamps_from_names,
     strip_extension,
 )
-from stillmap.io.trajectory import (
-    pose_from_quaternion,
-    pose_from_row,
-    rigid_transform,
-)
+from stillmap.io.trajectory import pose_from_quaternion, pose_from_row, rigid_transform
 
 Float = NDArray[np.float64]
 

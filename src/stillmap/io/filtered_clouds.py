@@ -127,7 +127,7 @@ def write_pcd(job: FilterJob) -> Omissions:
     """Copy a PCD file or folder; points of organised clouds become NaN, others are removed."""
 
     def filter_file(path: Path, new: Path, mask: Mask) -> None:
-        _copy_table(pcd.read_header(path).layout, new, mask, rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+")
+        _copy_table(pcd.read_header(path)[0], new, mask, rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+")
 
     return _write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
 

@@ -261,8 +261,6 @@ def poses_to_matrices(
         raise ValueError(f"{name}: expected {shapes}, got {_describe(array)}")
     require_length(name, len(array), count, like)
     array = array.astype(np.float64)
-    if count == 1 and size == 3 and not flat and _is_plainly_rigid(*array[0].tolist()):
-        return array  # of live odometry: what follows takes 50 times as long
     finite = np.isfinite(array).reshape(count, -1).all(axis=1)
     require_all(name, finite, "finite numbers", array)
     near = (np.abs(array) < MAX_TRANSLATION).all(axis=tuple(range(1, array.ndim)))
@@ -275,14 +273,6 @@ def poses_to_matrices(
     good = (skew < _MAX_SKEW) & (np.linalg.det(R) > 0.0) & (last_row < _MAX_SKEW)
     require_all(name, good, "rigid transforms", array)
     return array
-
-
-def _is_plainly_rigid(first: list[float], second: list[float], last: list[float]) -> bool:
-    """True if a matrix (3, 3) is a pose in the plane, well within the tolerances."""
-    (a, b, x), (c, d, y) = first, second
-    skew = abs(a * a + b * b - 1.0) + abs(c * c + d * d - 1.0) + abs(a * c + b * d)
-    is_near = abs(x) < MAX_TRANSLATION and abs(y) < MAX_TRANSLATION
-    return skew < 0.5 * _MAX_SKEW and a * d > b * c and is_near and last == [0.0, 0.0, 1.0]
 
 
 def _describe(array: NDArray[Any]) -> str:

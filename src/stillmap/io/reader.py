@@ -56,7 +56,7 @@ def read(
     """
     path, options = Path(path), options or ReadOptions()
     with explain_failure(path):
-        raw = detect_format(path).read(path, ReadContext(options, progress, scratch))
+        raw = detect_format(path).read([path], ReadContext(options, progress, scratch), ())
         return _finish(interpret(raw, options, scratch), options, scratch, str(path))
 
 
@@ -85,16 +85,16 @@ def read_parts(
     context = ReadContext(options, progress, scratch)
     with explain_failure(files[0]):
         forms = [detect_format(path) for path in files]
-        read_all = forms[0].read_parts if all(form is forms[0] for form in forms) else None
+        joins = forms[0].joins and all(form is forms[0] for form in forms)
         notes = [Part(path=str(path)) for path in files]
-        if read_all is None or not in_order:
+        if not (joins and in_order):
             parts = [_read_part(files, forms, k, context) for k in range(len(files))]
             order = sorted(range(len(files)), key=lambda k: parts[k].stamp_ns[[0, -1]].tolist())
             files, parts = [files[k] for k in order], [parts[k] for k in order]
             _require_run(files, parts)
             notes = [_describe(*part) for part in zip(files, parts, strict=True)]
-        if read_all is not None:
-            recording = interpret(read_all(files, context, ()), options, scratch)
+        if joins:
+            recording = interpret(forms[0].read(files, context, ()), options, scratch)
         else:
             recording = join_recordings(parts, [str(path) for path in files], scratch)
             window = TimeWindow(options)
@@ -182,11 +182,8 @@ def _read_part(
     """One of several inputs, of which others of its format may state what it lacks."""
     path, form = files[number], forms[number]
     context = part_context(context, number, len(files))
-    if form.read_parts is None:
-        raw = form.read(path, context)
-    else:
-        same = [file for file, of in zip(files, forms, strict=True) if of is form and file != path]
-        raw = form.read_parts([path], context, same)
+    others = [file for file, of in zip(files, forms, strict=True) if of is form and file != path]
+    raw = form.read([path], context, others)
     recording = interpret(raw, context.options, context.scratch)
     if not recording.n_scans:
         raise InputError("holds no scan", where=str(path))
@@ -285,48 +282,55 @@ def join_recordings(
     T_base_sensor, sensor, sensors = _join_sensors(parts)
     source = _join_notes(parts, names, sensors)
 
-    def join_beams(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def columns_of(name: str) -> list[NDArray[Any]] | None:
+        columns = [getattr(part, name) for part in parts]
+        return None if any(column is None for column in columns) else columns
+
+    def join(name: str) -> Any:
+        columns = columns_of(name)
+        return None if columns is None else np.concatenate(columns)[order]
+
+    def join_beams(name: str) -> Any:
+        columns = columns_of(name)
+        if columns is None:
+            return None
         builder = ArrayBuilder(columns[0].dtype, columns[0].shape[1:], scratch)
         for column in columns:
             for block in arrays.iter_blocks(column):
                 builder.append(column[block])
         return reorder_scans(builder.finish(), length, order, scratch)
 
-    odometry = [part.T_odom_base for part in parts if part.T_odom_base is not None]
-    recorded = [part.T_recorded_base for part in parts if part.T_recorded_base is not None]
-    if recorded and not _are_continuous(parts, recorded):
+    is_posed = _are_continuous(parts)
+    if not is_posed and any(part.T_recorded_base is not None for part in parts):
         text = "the recorded poses of the parts do not continue each other: not used"
         source.warnings.append(text)
-        recorded = []
-    times = [part.beam_time for part in parts if part.beam_time is not None]
     images = [part.images for part in parts if part.images is not None]
     return Recording(
         stamp_ns=stamp_ns[order],
         offset=np.concatenate([[0], np.cumsum(length[order])]).astype(np.int64),
-        points=join_beams([part.points for part in parts]),
-        hit=join_beams([part.hit for part in parts]),
+        points=join_beams("points"),
+        hit=join_beams("hit"),
         T_base_sensor=T_base_sensor,
         sensor=sensor[order],
-        T_odom_base=np.concatenate(odometry)[order] if odometry else None,
+        T_odom_base=join("T_odom_base"),
         source=source,
-        beam_time=join_beams(times) if len(times) == len(parts) else None,
-        T_recorded_base=np.concatenate(recorded)[order] if recorded else None,
+        beam_time=join_beams("beam_time"),
+        T_recorded_base=join("T_recorded_base") if is_posed else None,
         images=cameras.merge_images(images) if images else None,
         scratch=scratch,
     )
 
 
-def _are_continuous(parts: Sequence[Recording], poses: Sequence[Float]) -> bool:
-    """True if all parts have poses, which go on from one to the next."""
-    if len(poses) < len(parts):
-        return False
-    pairs = zip(pairwise(parts), pairwise(poses), strict=True)
-    return not any(_find_jump(*pair, *ends) for pair, ends in pairs)
+def _are_continuous(parts: Sequence[Recording]) -> bool:
+    """True if all parts have recorded poses, which go on from one to the next."""
+    for before, after in pairwise(parts):
+        A, B = before.T_recorded_base, after.T_recorded_base
+        if A is None or B is None or _find_jump(before, after, A, B):
+            return False
+    return True
 
 
-def _join_sensors(
-    parts: Sequence[Recording],
-) -> tuple[Float, NDArray[np.int32], list[SensorNotes]]:
+def _join_sensors(parts: Sequence[Recording]) -> tuple[Float, NDArray[np.int32], list[SensorNotes]]:
     """Poses of the sensors of all parts, that of each scan, and the notes on them.
 
     Those of the first part, unless one moves: then it has a pose per place, and one note.

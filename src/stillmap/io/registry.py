@@ -27,9 +27,8 @@ RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated 
 _HEAD = 1 << 16  # bytes from which a format is detected
 _FORMATS_HINT = "`stillmap info -h` lists the formats"
 
-Reader = Callable[[Path, ReadContext], Recording | RawLasers]
 # reads parts of a run, in order of time, as one recording; others may be further parts
-PartsReader = Callable[[Sequence[Path], ReadContext, Sequence[Path]], Recording | RawLasers]
+Reader = Callable[[Sequence[Path], ReadContext, Sequence[Path]], Recording | RawLasers]
 
 
 class Format(NamedTuple):
@@ -39,16 +38,16 @@ class Format(NamedTuple):
         name: readable name.
         endings: of names of its files or folders; they decide where the content does not.
         matches: whether a file with these first bytes, or a folder (None), has the format.
-        read: reader of a path.
-        read_parts: reader of parts of one run, where that needs more than joining recordings: the
-            beams are then those of the whole recording, to the bit. None: it does not.
+        read: reader of one path, or of parts of one run.
+        joins: whether it reads several parts, where that needs more than joining recordings: the
+            beams are then those of the whole recording, to the bit.
     """
 
     name: str
     endings: tuple[str, ...]
     matches: Callable[[Path, bytes | None], bool]
     read: Reader
-    read_parts: PartsReader | None = None
+    joins: bool = False
 
 
 def _is_carmen(path: Path, start: bytes | None) -> bool:  # noqa: ARG001
@@ -62,7 +61,8 @@ def _is_stillmap_folder(path: Path, start: bytes | None) -> bool:
     return header.is_file() if start is None else path.name == stillmap_folder.HEADER
 
 
-def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
+def _read_stillmap_folder(paths: Sequence[Path], context: ReadContext, *_: Any) -> Recording:
+    path = paths[0]
     folder, options = path if path.is_dir() else path.parent, context.options
     of_bags = ("topic", "tilting_topic", "base_frame", "odom_frame")
     for name in of_bags:
@@ -74,60 +74,49 @@ def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
     return select_time(recording, window, str(path)) if window else recording
 
 
-def _of_folder(is_one: Callable[[Path], bool]) -> Callable[[Path, bytes | None], bool]:
-    return lambda path, start: start is None and is_one(path)
-
-
 def load_later(module: str, function: str = "read") -> Any:
     """A function of a module of this room, which is loaded when it is called."""
     return lambda *args: getattr(import_module(f"stillmap.io.{module}"), function)(*args)
 
 
-def _point_cloud_format(
-    name: str, endings: tuple[str, ...], read: Reader, has_magic: Callable[[bytes], bool] = bool
+def _folder_format(name: str, endings: tuple[str, ...], module: Any, is_one: Any) -> Format:
+    return Format(name, endings, lambda path, start: start is None and is_one(path), _one(module))
+
+
+def _one(module: Any) -> Reader:
+    """The reader of a module, which reads one path."""
+    return lambda paths, context, _: module.read(paths[0], context)
+
+
+def _cloud_format(
+    name: str, module: Any, has_magic: Callable[[bytes], bool] | bytes = b""
 ) -> Format:
     """A format of files, detected by first bytes or by name, and of folders of such files."""
+    magic, endings = has_magic, module.EXTENSIONS
 
     def matches(path: Path, start: bytes | None) -> bool:
         if start is None:
             return contains_files(path, endings)
-        return has_magic(start) and (has_magic is not bool or has_extension(path, endings))
+        if not magic:
+            return bool(start) and has_extension(path, endings)
+        return start.startswith(magic) if isinstance(magic, bytes) else magic(start)
 
-    return Format(name, endings, matches, read)
+    return Format(name, endings, matches, _one(module))
 
 
-_ROS, _CARMEN = "ros.reader", "carmen.reader"
 _LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz")
-
+_HEADER, _KITTI = (stillmap_folder.HEADER,), ("velodyne/", "velodyne_points/")
 FORMATS = (
-    Format(
-        "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
-    ),
-    Format(
-        "ROS bag",
-        messages.ENDINGS,
-        messages.is_bag,
-        load_later(_ROS),
-        load_later(_ROS, "read_parts"),
-    ),
-    Format(
-        "KITTI folder",
-        ("velodyne/", "velodyne_points/"),
-        _of_folder(kitti.is_kitti_folder),
-        kitti.read,
-    ),
-    Format(
-        "RGB-D folder",
-        ("frame-*.depth.png", "depth.txt"),
-        _of_folder(rgbd.is_rgbd_folder),
-        rgbd.read,
-    ),
-    _point_cloud_format("PCD", pcd.EXTENSIONS, pcd.read, pcd.is_pcd),
-    _point_cloud_format("3DTK", threedtk.EXTENSIONS, threedtk.read),
-    _point_cloud_format("E57", e57.EXTENSIONS, e57.read, e57.is_e57),
-    _point_cloud_format("LAS", las.EXTENSIONS, las.read, las.is_las),
-    _point_cloud_format("PLY", ply.EXTENSIONS, ply.read, ply.is_ply),
-    Format("CARMEN log", _LOGS, _is_carmen, load_later(_CARMEN), load_later(_CARMEN, "read_parts")),
+    Format("stillmap recording", _HEADER, _is_stillmap_folder, _read_stillmap_folder),
+    Format("ROS bag", messages.ENDINGS, messages.is_bag, load_later("ros.reader"), joins=True),
+    _folder_format("KITTI folder", _KITTI, kitti, kitti.is_kitti_folder),
+    _folder_format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd, rgbd.detect_layout),
+    _cloud_format("PCD", pcd, pcd.is_pcd),
+    _cloud_format("3DTK", threedtk),
+    _cloud_format("E57", e57, e57.MAGIC),
+    _cloud_format("LAS", las, las.MAGIC),
+    _cloud_format("PLY", ply, ply.is_ply),
+    Format("CARMEN log", _LOGS, _is_carmen, load_later("carmen.reader"), joins=True),
 )
 
 

@@ -80,11 +80,6 @@ def detect_layout(path: Path) -> str | None:
         return None
 
 
-def is_rgbd_folder(path: Path) -> bool:
-    """True if a folder has one of the layouts."""
-    return detect_layout(path) is not None
-
-
 def list_frames(path: Path) -> Frames:
     """List the images and poses of a folder.
 

@@ -152,9 +152,7 @@ def image_message(messages, stamp, pixels, encoding, row_bytes=None, **changes):
 
 def bag_with_images(messages, rng, image_messages):
     columns = columns_of(*xyz(rng))
-    mounts = [
-        messages.transform(0, "lidar", "camera", (0.1, 0.2, 0.3), (-0.5, 0.5, -0.5, 0.5)),
-    ]
+    mounts = [messages.transform(0, "lidar", "camera", (0.1, 0.2, 0.3), (-0.5, 0.5, -0.5, 0.5))]
     content = [("/tf_static", START, messages.tf(*mounts))]
     for k in range(3):
         stamp = START + k * SECOND

@@ -12,7 +12,7 @@ from stillmap.core import se2
 from stillmap.io import writers
 from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
-from stillmap.io.ros.reader import read_parts
+from stillmap.io.ros.reader import read as read_bags
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import interpret
 from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
@@ -90,7 +90,7 @@ def bag_of(folder, rig, joint_ns=None, kind="mcap"):
 
 
 def read_tilting(context, *paths):
-    return interpret(read_parts(paths, context, tilting=True), context.options, None)
+    return interpret(read_bags(paths, context, tilting=True), context.options, None)
 
 
 @pytest.fixture(scope="module")

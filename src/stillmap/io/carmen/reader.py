@@ -38,16 +38,7 @@ _MAX_OFFSET = 3.0  # m on a robot
 _MIN_OFFSET = 0.002  # m or rad: less is rounding
 
 
-def read(path: Path, context: ReadContext) -> RawLasers:
-    """Read a CARMEN log; see `read_parts`."""
-    return read_parts([path], context)
-
-
-def read_parts(
-    paths: Sequence[Path],
-    context: ReadContext,
-    others: Sequence[Path] = (),
-) -> RawLasers:
+def read(paths: Sequence[Path], context: ReadContext, others: Sequence[Path] = ()) -> RawLasers:
     """Read the parts of a CARMEN log, in order of time, as one.
 
     Bad records are counted in `source.skipped` (scans) and `source.skipped_odometry`, with

@@ -50,11 +50,6 @@ _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
-def is_e57(head: bytes) -> bool:
-    """True if a file with these first bytes is an E57 file."""
-    return head.startswith(MAGIC)
-
-
 def read(path: Path, context: ReadContext) -> Recording:
     """Read one E57 file or a folder of them.
 

@@ -45,11 +45,6 @@ def read(path: Path, context: ReadContext) -> Recording:
     return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, context)
 
 
-def is_las(head: bytes) -> bool:
-    """True if a file with these first bytes is a LAS or LAZ file."""
-    return head.startswith(MAGIC)
-
-
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     with open_las_reader(path) as reader:
         columns = ([block.x, block.y, block.z] for block in iter_blocks(reader, path))

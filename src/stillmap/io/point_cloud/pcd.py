@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +41,7 @@ _MAX_EXPANSION = 100  # unpacked over packed bytes: LZF reaches a little less
 _MIN_VIEWPOINT_DISTANCE = 5.0  # m from the origin, to detect the frame of the points
 
 
-class PcdHeader(NamedTuple):
-    """Layout, ordered where points lie in rows, and VIEWPOINT `T` (4, 4; None: invalid)."""
-
-    layout: TableLayout
-    T: NDArray[np.float64] | None
+Header = tuple[TableLayout, NDArray[np.float64] | None]
 
 
 def is_pcd(head: bytes) -> bool:
@@ -60,8 +55,8 @@ def is_pcd(head: bytes) -> bool:
     return False
 
 
-def read_header(path: Path) -> PcdHeader:
-    """Read the header.
+def read_header(path: Path) -> Header:
+    """The layout, ordered where points lie in rows, and VIEWPOINT (4, 4); None: it is invalid.
 
     Raises:
         InputError: it is missing, truncated or invalid.
@@ -78,7 +73,7 @@ def read_header(path: Path) -> PcdHeader:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
-def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: int) -> PcdHeader:
+def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: int) -> Header:
     names, kinds, sizes = entries["FIELDS"], entries["TYPE"], entries["SIZE"]
     counts = [int(word) for word in entries.get("COUNT", ["1"] * len(names))]
     dtypes = [
@@ -96,7 +91,7 @@ def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: 
     is_text, is_compressed = kind == "ascii", kind == "binary_compressed"
     ordered = height != "1"
     layout = TableLayout(path, fields, rows, start, start, lines, is_text, is_compressed, ordered)
-    return PcdHeader(layout, _parse_viewpoint(entries.get("VIEWPOINT")))
+    return layout, _parse_viewpoint(entries.get("VIEWPOINT"))
 
 
 def _parse_viewpoint(words: list[str] | None) -> NDArray[np.float64] | None:
@@ -204,7 +199,7 @@ def _detect_map_frame(files: list[Path]) -> bool:
     farthest, at = None, _MIN_VIEWPOINT_DISTANCE
     for file in files:
         with suppress(InputError, OSError):
-            T = read_header(file).T
+            _, T = read_header(file)
             if T is not None and np.linalg.norm(T[:3, 3]) > at:
                 farthest, at = file, float(np.linalg.norm(T[:3, 3]))
     with suppress(InputError, OSError, MemoryError):

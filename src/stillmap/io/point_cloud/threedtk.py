@@ -15,12 +15,7 @@ from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.clouds import (
-    Cloud,
-    CloudSource,
-    build_recording,
-    files_of,
-)
+from stillmap.io.point_cloud.clouds import Cloud, CloudSource, build_recording, files_of
 from stillmap.io.point_cloud.table import Field, TableLayout, is_blank, read_columns, require_all
 from stillmap.io.text_lines import read_lines, strip_extension
 from stillmap.io.trajectory import rigid_transform

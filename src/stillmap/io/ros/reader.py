@@ -44,12 +44,7 @@ _STATIC = "tf_static"
 _PROGRESS_INTERVAL = 2000  # messages
 
 
-def read(path: Path, context: ReadContext) -> Recording | RawLasers:
-    """Read a bag: ROS 1, or a file or folder of ROS 2; see `read_parts`."""
-    return read_parts([path], context)
-
-
-def read_parts(
+def read(
     paths: Sequence[Path],
     context: ReadContext,
     others: Sequence[Path] = (),
@@ -95,11 +90,7 @@ def read_parts(
 
 
 def _read_bag(
-    bag: Bag,
-    context: ReadContext,
-    reopen: Callable[[], Bag],
-    others: Sequence[Path],
-    tilting: bool,
+    bag: Bag, context: ReadContext, reopen: Callable[[], Bag], others: Sequence[Path], tilting: bool
 ) -> Recording | RawLasers:
     topics = select_topics(bag, context.options)
     content = collect_messages(bag, topics.uses, context)
