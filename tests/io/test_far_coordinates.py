@@ -1,13 +1,10 @@
 """Coordinates of map projections in files that are read and written, and such that cannot be."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
-from stillmap.io import write as write_folder
 from stillmap.io.point_cloud import pcd, ply
 from stillmap.io.trajectory import read_tum, write_tum
 
@@ -90,13 +87,3 @@ def test_a_trajectory_in_a_projection_keeps_the_nanometre(tmp_path):
     poses[:, :3, 3] = np.array([1e7, -1e7, 9000.0]) + np.arange(3)[:, None] * 0.123456789
     write_tum(tmp_path / "poses.tum", np.arange(3) * 10**9, poses)
     np.testing.assert_allclose(read_tum(tmp_path / "poses.tum")[1], poses, rtol=0, atol=4e-9)
-
-
-@pytest.mark.parametrize("number", [1e10, np.nan, np.inf])
-def test_a_recording_folder_whose_poses_cannot_be(space, tmp_path, number):
-    poses = space.T_recorded_base.copy()
-    write_folder(dataclasses.replace(space), tmp_path / "folder")
-    poses[1, 0, 3] = number
-    np.save(tmp_path / "folder" / "T_recorded_base.npy", poses)
-    with pytest.raises(InputError, match=r"T_recorded_base\.npy: .* pose 1 is not finite"):
-        read(tmp_path / "folder")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from peak_memory import run_measured
-from PIL import Image
+from PIL import Image, ImageFile
 
 from stillmap.core.errors import InputError
 from stillmap.io.cameras import read_image, read_image_size
@@ -63,6 +63,14 @@ def test_a_picture_that_nobody_may_read(picture, monkeypatch):
     assert said(picture) == f"{picture}: cannot be read: Permission denied"
     monkeypatch.setattr(Path, "is_file", denied)
     assert said(picture) == f"{picture}: cannot be read: Permission denied"
+
+
+def test_a_picture_that_wants_all_memory_is_damaged(picture, monkeypatch):
+    def load(_):
+        raise MemoryError
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", load)
+    assert said(picture) == f"{picture}: is no image: it does not fit into memory"
 
 
 def test_a_small_file_does_not_unpack_to_a_gigabyte(tmp_path):

@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from PIL import Image, ImageFile
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
@@ -84,20 +84,6 @@ def test_poses_that_cannot_be_used_cost_the_poses(folder, files, what):
     assert found.T_recorded_base is None
     assert found.n_scans == 3
     assert any(what in warning for warning in found.source.warnings), found.source.warnings
-
-
-def test_a_picture_that_wants_all_memory_is_damaged(folder, monkeypatch):
-    (folder / "image_2").mkdir()
-    for i in range(3):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(folder / "image_2" / f"{i:06d}.png")
-    recording = read(folder)
-
-    def load(_):
-        raise MemoryError
-
-    monkeypatch.setattr(ImageFile.ImageFile, "load", load)
-    with pytest.raises(InputError, match="does not fit into memory"):
-        recording.images.read(0)
 
 
 def test_pictures(folder):

@@ -1,12 +1,11 @@
 """2D recordings in the form of LaserScan messages."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillmap.core.recording import Recording
-from stillmap.core.source import RangeRule, SensorNotes, Source
+from stillmap.core.source import SensorNotes, Source
 from stillmap.io import laser_scan
 
 
@@ -73,28 +72,6 @@ def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
     first, step = laser_scan.beam_angles(recording([(angles, lone)]))[0]
     assert np.isclose(first + 3 * step, angles[3])
     assert np.isfinite(laser_scan.beam_angles(recording([(angles, blind)]))).all()
-
-
-def test_how_far_lasers_see():
-    rule = RangeRule(81.91, "", "unusable", "", None, "", 0.0)
-    noted = SensorNotes(ranges=rule)
-    scans = [([0.0, 1.0], [3.0, 7.0]), ([0.0, 1.0], [4.0, 9.0]), ([0.0], [np.nan])]
-    one = recording(
-        scans,
-        hit=[True, False, True, True, False],
-        sensor=[0, 1, 2],
-        sensors=[SensorNotes(), noted],
-    )
-    first, second, third = laser_scan.range_limits(one)
-    assert first == (pytest.approx(3.0), pytest.approx(7.0))
-    assert second.declared == 81.91
-    assert third == (0.0, None)
-    # a hit is never at the limit: readers take what reaches it for maximum range
-    for reach, hit in ((first, 3.0), (second, 9.0)):
-        assert np.float32(reach.max_range()) > np.float32(hit)
-    clipped = laser_scan.RangeLimits(5.0, 5.0)
-    assert np.float32(clipped.max_range()) > np.float32(5.0)
-    assert clipped.max_range() < 5.00001
 
 
 def test_even_times_are_a_step_from_beam_to_beam():

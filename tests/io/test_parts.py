@@ -14,7 +14,6 @@ from stillmap.core.source import SensorNotes, Source
 from stillmap.io import read, writers
 from stillmap.io.reader import join_recordings, read_parts
 from stillmap.pipeline import inputs
-from stillmap.prepare.options import ReadOptions
 
 FORMS = {
     2: {
@@ -60,19 +59,6 @@ def test_parts_in_any_order_are_the_whole(dimension, form, tmp_path):
     assert [part.scans for part in noted] == [20, 15, 25]
     assert noted[1].first_stamp_ns == START * 10**9 + 20 * int(1e9 * PERIOD)
     assert joined.source.path == paths[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("dimension", "form"), CASES)
-def test_the_time_window_counts_from_the_first_part(dimension, form, tmp_path):
-    ending, recording = FORMS[dimension][form], make_recording(dimension)
-    paths = write_parts(recording, tmp_path, form, ending, *SPANS)
-    options = ReadOptions(start=1.0, end=3.0)
-    joined = inputs.read(paths[::-1], options)
-    require_equal(joined, read(write_whole(recording, tmp_path, form, ending), options))
-    assert joined.n_scans == 21
-    with pytest.raises(InputError, match=r"has no scan from 50 s .*spans 0 to 5\.90 s"):
-        inputs.read(paths, ReadOptions(start=50.0))
 
 
 def test_lines_that_the_first_part_of_a_log_alone_has(tmp_path, drive):

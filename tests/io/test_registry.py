@@ -1,7 +1,6 @@
 """Detection of formats, and errors of one line."""
 
 import gzip
-import os
 
 import pytest
 
@@ -99,13 +98,6 @@ def test_formats_are_listed_where_errors_say(tmp_path, capsys):
         main(["info", "--help"])
     told = capsys.readouterr().out
     assert [one.name for one in FORMATS if one.name.partition(" ")[0] not in told] == []
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
-def test_named_pipe(tmp_path):
-    os.mkfifo(tmp_path / "pipe.log")
-    with pytest.raises(InputError, match="regular file"):
-        read(tmp_path / "pipe.log")
 
 
 @pytest.mark.parametrize("path", ["a\0b.log", "x" * 5000 + ".log"])

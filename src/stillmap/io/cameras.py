@@ -386,7 +386,9 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
                     raise InputError("is too large an image", where=str(path))
                 yield image
     except (*_DAMAGED, *_TOO_LARGE) as error:
-        what = f"is no image: {error or 'it does not fit into memory'}"  # a length in its header
+        what = (
+            f"is no image: {str(error) or 'it does not fit into memory'}"  # a length in its header
+        )
         if isinstance(error, OSError) and error.strerror:
             what = f"cannot be read: {error.strerror}"
         elif isinstance(error, _TOO_LARGE):

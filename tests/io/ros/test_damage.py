@@ -1,11 +1,12 @@
 """Damaged bags: an error of one line, or skipped messages."""
 
-import shutil
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from small_bags import Messages, write_bag
 
 from stillmap.core.errors import InputError
@@ -55,11 +56,10 @@ def test_cut(bag, messages, kind, share):
     np.testing.assert_allclose(got, 2.0 + 0.05 * k, rtol=1e-6)
 
 
-def test_no_index(bag, messages, kind):
+def test_no_index(tmp_path):
     """As a killed recorder leaves a bag."""
-    if kind != "bag":
-        pytest.skip("ROS 1 alone")
-    path = bag(scans_of(messages, 20))
+    messages = Messages("ros1")
+    path = write_bag(tmp_path, "bag", messages, scans_of(messages, 20))
     content = path.read_bytes()
     at = content.index(b"index_pos=") + len("index_pos=")
     path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
@@ -125,52 +125,31 @@ def test_invalid_transforms(bag, messages):
     assert recording.source.skipped_odometry["transform that is none"].count == 4
 
 
-@pytest.mark.parametrize("packing", ["bz2", "lz4"])
-def test_compressed_chunks(tmp_path, packing):
-    from rosbags.rosbag1 import Writer
-
-    messages = Messages("ros1")
-    content = scans_of(messages, 20)
-    path = write_bag(
-        tmp_path, "bag", messages, content, fmt=Writer.CompressionFormat[packing.upper()]
-    )
-    assert read(path).n_scans == 20
-
-
 @pytest.mark.parametrize(
-    ("kind", "mode"), [("folder", "MESSAGE"), ("folder", "FILE"), ("mcap", "STORAGE")]
+    ("kind", "packing"),
+    [
+        ("bag", {"fmt": Writer.CompressionFormat.BZ2}),
+        ("bag", {"fmt": Writer.CompressionFormat.LZ4}),
+        ("folder", {"mode": CompressionMode.MESSAGE, "fmt": CompressionFormat.ZSTD}),
+        ("folder", {"mode": CompressionMode.FILE, "fmt": CompressionFormat.ZSTD}),
+        ("mcap", {"mode": CompressionMode.STORAGE, "fmt": CompressionFormat.ZSTD}),
+    ],
 )
-def test_compressed_ros2(tmp_path, kind, mode):
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode
-
-    messages = Messages("cdr")
-    path = write_bag(
-        tmp_path,
-        kind,
-        messages,
-        scans_of(messages, 20),
-        mode=CompressionMode[mode],
-        fmt=CompressionFormat.ZSTD,
-    )
+def test_compressed_bags(tmp_path, kind, packing):
+    messages = Messages("ros1" if kind == "bag" else "cdr")
+    path = write_bag(tmp_path, kind, messages, scans_of(messages, 20), **packing)
     assert read(path).n_scans == 20
 
 
-def test_folder_without_metadata(bag, messages, kind):
-    if kind != "folder":
-        pytest.skip("folders alone")
-    path = bag(scans_of(messages, 5))
+def test_folders_whose_metadata_lacks_or_names_more(tmp_path):
+    messages = Messages("cdr")
+    path = write_bag(tmp_path, "folder", messages, scans_of(messages, 5))
+    file = file_of(path)
+    file.rename(path / "other.db3")
+    with pytest.raises(InputError, match=rf"lacks the file '{file.name}'"):
+        read(path)
     (path / "metadata.yaml").unlink()
     assert read(path).n_scans == 5
-
-
-def test_folder_with_a_missing_file(bag, messages, kind):
-    if kind != "folder":
-        pytest.skip("folders alone")
-    path = bag(scans_of(messages, 5))
-    shutil.copy(file_of(path), path / "other.db3")
-    file_of(path).unlink() if file_of(path).name != "other.db3" else (path / "tiny.db3").unlink()
-    with pytest.raises(InputError, match=r"lacks the file 'tiny\.db3'"):
-        read(path)
 
 
 @pytest.mark.parametrize(
