@@ -43,7 +43,7 @@ def _split_bag(data: bytes) -> tuple[list[Record], bytes]:
     return found, data[at:]
 
 
-def _join_bag(records: list[Record]) -> bytes:
+def join_bag(records: list[Record]) -> bytes:
     return b"".join(
         struct.pack("<I", len(head)) + head + struct.pack("<I", len(content)) + content
         for head, content in records
@@ -59,7 +59,7 @@ def _fields(head: bytes) -> dict[bytes, bytes]:
     return out
 
 
-def _head(fields: dict[bytes, bytes]) -> bytes:
+def make_head(fields: dict[bytes, bytes]) -> bytes:
     lines = [name + b"=" + value for name, value in fields.items()]
     return b"".join(struct.pack("<I", len(line)) + line for line in lines)
 
@@ -79,7 +79,7 @@ def mutate_bag(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
             head, content = records[k]
             new = (mutate(head), content) if chance.random() < 0.5 else (head, mutate(content))
             records[k] = new
-            return data[:start] + _join_bag(records) + rest
+            return data[:start] + join_bag(records) + rest
         k = chance.choice(chunks)
         fields = _fields(records[k][0])
         inside = _UNPACK[fields[b"compression"]](records[k][1])
@@ -88,20 +88,20 @@ def mutate_bag(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
             m = chance.randrange(len(inner))
             head, content = inner[m]
             inner[m] = head, _resize(mutate(content), content, chance)
-            inside = _join_bag(inner) + tail
+            inside = join_bag(inner) + tail
         else:
             inside = _resize(mutate(inside), inside, chance)
         packed = _PACK[fields[b"compression"]](inside)
         fields[b"size"] = struct.pack("<I", len(inside))
         moved = len(packed) - len(records[k][1])
-        records[k] = _head(fields), packed
+        records[k] = make_head(fields), packed
         first = _fields(records[0][0])
         (index,) = struct.unpack("<Q", first[b"index_pos"])
         first[b"index_pos"] = struct.pack("<Q", index + moved)
-        records[0] = _head(first), records[0][1]
+        records[0] = make_head(first), records[0][1]
     except (LookupError, ValueError, OSError, RuntimeError, struct.error):
         return mutate(data)
-    return data[:start] + _join_bag(records) + rest
+    return data[:start] + join_bag(records) + rest
 
 
 # MCAP
@@ -120,7 +120,7 @@ def _split_mcap(data: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
-def _join_mcap(records: list[tuple[int, bytes]]) -> bytes:
+def join_mcap(records: list[tuple[int, bytes]]) -> bytes:
     return b"".join(
         bytes([kind]) + struct.pack("<Q", len(content)) + content for kind, content in records
     )
@@ -135,7 +135,7 @@ def mutate_mcap(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
             k = chance.randrange(len(records))
             kind, content = records[k]
             records[k] = kind, _resize(mutate(content), content, chance)
-            return _MAGIC + _join_mcap(records) + _MAGIC
+            return _MAGIC + join_mcap(records) + _MAGIC
         content = records[chunk][1]
         (n,) = struct.unpack_from("<I", content, 28)
         packing = content[32 : 32 + n]
@@ -146,7 +146,7 @@ def mutate_mcap(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
             kind, old = inner[m]
             keep = 22 if kind == 5 and chance.random() < 0.8 else 0
             inner[m] = kind, old[:keep] + _resize(mutate(old[keep:]), old[keep:], chance)
-            inside = _join_mcap(inner)
+            inside = join_mcap(inner)
         else:
             inside = _resize(mutate(inside), inside, chance)
         packed = _PACK2[packing](inside)
@@ -156,7 +156,7 @@ def mutate_mcap(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
         records = [_shift_offsets(record, moved, len(inside), len(packed)) for record in records]
     except (LookupError, ValueError, OSError, RuntimeError, struct.error, zstd.ZstdError):
         return mutate(data)
-    return _MAGIC + _join_mcap(records) + _MAGIC
+    return _MAGIC + join_mcap(records) + _MAGIC
 
 
 def _shift_offsets(
