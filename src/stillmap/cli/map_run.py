@@ -106,13 +106,13 @@ def _read_tilting_laser(
 
 
 def _read_topic(paths: Sequence[Path], context: ReadContext) -> Recording:
-    from stillmap.io.ros.reader import read_parts  # message types take long to load
+    from stillmap.io.ros.reader import read as read_bags  # message types take long to load
 
     for path in paths:
         if detect_format(path).name != "ROS bag":
             raise InputError("--tilting-topic is for bags", where=str(path))
     with np.errstate(over="ignore", invalid="ignore"):
-        raw = read_parts(paths, context, tilting=True)
+        raw = read_bags(paths, context, tilting=True)
         return interpret(raw, context.options, context.scratch)
 
 

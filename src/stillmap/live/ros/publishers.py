@@ -21,8 +21,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.grid_map import GridMap
-from stillmap.io.rigid_transforms import embed_in_3d, quaternion_from_pose
 from stillmap.io.ros.messages import stamp_ns
+from stillmap.io.trajectory import embed_in_3d, quaternion_from_pose
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
 from stillmap.live.ros.intake import Arrival

@@ -12,9 +12,9 @@ from tf2_ros import Buffer, TransformException
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float
-from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.io.ros.messages import frame_name
 from stillmap.io.ros.tf import project_to_plane
+from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.live.ros.messages import Mount
 from stillmap.live.ros.parameters import Parameters
 
