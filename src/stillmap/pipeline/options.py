@@ -25,8 +25,8 @@ class OutputOptions:
 
     map_mode: MapMode = option(
         "trinary",
-        "Pixel encoding of the map image: trinary (occupied, unknown, free), scale (grey levels; "
-        "PNG with transparency) or raw (occupancy in percent, 255 unknown).",
+        "Pixels of the map image: trinary (occupied, unknown, free), scale (grey levels; PNG with "
+        "transparency) or raw (occupancy in percent, 255 unknown).",
     )
     map_state: MapState = option(
         "last",
@@ -34,36 +34,27 @@ class OutputOptions:
         "(majority); or the last one with all doors open or shut.",
     )
     min_obstacle_height: float = option(
-        0.2,
-        "Lowest height above the ground, in metres, that counts as an obstacle in the 2D map of 3D "
-        "recordings.",
-        ge=0.0,
+        0.2, "Lowest height of obstacles above the ground in maps of 3D recordings, m.", ge=0.0
     )
-    max_obstacle_height: float = option(
-        1.8, "Greatest height above the ground, in metres, that counts as an obstacle.", le=100.0
-    )
-
+    max_obstacle_height: float = option(1.8, "Greatest height of these, m.", le=100.0)
     region: tuple[float, float, float, float] | None = option(
         None,
-        "Part of the map frame that is written: x0, y0, x1, y1 in metres. Poses and labels are of "
-        "all scans; unset: everything.",
+        "Part of the map frame that is written: x0, y0, x1, y1 in metres; unset: everything. Poses "
+        "and labels are of all scans.",
         strict=False,  # TOML and JSON have lists
     )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         """Refuses an empty band of heights, and an empty region."""
-        if self.region is not None:
-            x0, y0, x1, y1 = self.region
-            if not (x0 < x1 and y0 < y1):
-                raise ValueError(
-                    "'output.region' must be x0 y0 x1 y1 with x0 < x1 and y0 < y1, got "
-                    + " ".join(f"{value:g}" for value in self.region)
-                )
+        x0, y0, x1, y1 = self.region or (0.0, 0.0, 1.0, 1.0)
+        if not (x0 < x1 and y0 < y1):
+            corners = f"{x0:g} {y0:g} {x1:g} {y1:g}"
+            what = "'output.region' must be x0 y0 x1 y1 with x0 < x1 and y0 < y1"
+            raise ValueError(f"{what}, got {corners}")
         if not self.min_obstacle_height < self.max_obstacle_height:
-            raise ValueError(
-                "'output.min_obstacle_height' must be less than 'output.max_obstacle_height'"
-            )
+            what = "'output.min_obstacle_height' must be less than 'output.max_obstacle_height'"
+            raise ValueError(what)
         return self
 
 

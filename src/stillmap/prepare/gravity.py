@@ -5,7 +5,7 @@ the surface normals near it (floors, tables, shelves), then to the normal of the
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,13 +24,6 @@ _MIN_EXTENT = 0.2  # m, standard deviation along the shorter side of a plane
 _MAX_REFINEMENTS = 5
 
 
-class _Surfaces(NamedTuple):
-    """(n, 3) surface points and unit normals in the recorded map frame."""
-
-    points: Float
-    normals: Float
-
-
 def align_to_gravity(recording: Recording) -> Recording:
     """Rotate the recorded poses about their origin so that z points up.
 
@@ -46,7 +39,7 @@ def align_to_gravity(recording: Recording) -> Recording:
     length = float(np.linalg.norm(mean))
     if length < _MIN_MEAN_UP:
         return _with_note(recording, {"by": "nothing: the cameras have arbitrary orientations"})
-    up, by = _refine_up(_collect_surfaces(recording, T), mean / length)
+    up, by = _refine_up(*_collect_surfaces(recording, T), mean / length)
     rotation = np.eye(4)
     rotation[:3, :3] = _rotation_to_z(up)
     angle = float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
@@ -68,7 +61,8 @@ def _with_note(recording: Recording, what: dict[str, Any]) -> Recording:
     return replace(recording, source=replace(recording.source, details=details))
 
 
-def _collect_surfaces(recording: Recording, T: Float) -> _Surfaces:
+def _collect_surfaces(recording: Recording, T: Float) -> tuple[Float, Float]:
+    """(n, 3) surface points and unit normals in the recorded map frame."""
     grid = recording.source.sensors[0].grid
     assert grid is not None
     rows, columns = grid
@@ -88,18 +82,18 @@ def _collect_surfaces(recording: Recording, T: Float) -> _Surfaces:
         in_map = corner.reshape(-1, 3)[good] @ T[scan, :3, :3].T + T[scan, :3, 3]
         points.append(in_map)
         normals.append((normal[good] / length[good, None]) @ T[scan, :3, :3].T)
-    return _Surfaces(np.concatenate(points), np.concatenate(normals))
+    return np.concatenate(points), np.concatenate(normals)
 
 
-def _refine_up(surfaces: _Surfaces, up: Float) -> tuple[Float, str]:
+def _refine_up(points: Float, normals: Float, up: Float) -> tuple[Float, str]:
     """Upward direction (3,), and what determined it."""
     from_cameras = up, "cameras"
-    upward = surfaces.normals @ up > 0.0
+    upward = normals @ up > 0.0
     if not upward.any():
         return from_cameras
     # gnomonic projection of the normals, centred at `up`
     R = _rotation_to_z(up)
-    rotated = surfaces.normals[upward] @ R.T
+    rotated = normals[upward] @ R.T
     flat = rotated[:, :2] / rotated[:, 2:]
     near = (np.abs(flat) < _MAX_TILT).all(axis=1)
     if not near.any():
@@ -110,22 +104,22 @@ def _refine_up(surfaces: _Surfaces, up: Float) -> tuple[Float, str]:
     mode = R.T @ np.array([edges[peak[0]] + 0.5 * _BIN, edges[peak[1]] + 0.5 * _BIN, 1.0])
     mode /= np.linalg.norm(mode)
     for _ in range(_MAX_REFINEMENTS):
-        aligned = surfaces.normals @ mode > _MIN_COSINE
-        if aligned.sum() < _MIN_SHARE * len(surfaces.normals):
+        aligned = normals @ mode > _MIN_COSINE
+        if aligned.sum() < _MIN_SHARE * len(normals):
             return from_cameras
-        mode = surfaces.normals[aligned].mean(axis=0)
+        mode = normals[aligned].mean(axis=0)
         mode /= np.linalg.norm(mode)
-    return _fit_largest_plane(surfaces, mode)
+    return _fit_largest_plane(points, normals, mode)
 
 
-def _fit_largest_plane(surfaces: _Surfaces, up: Float) -> tuple[Float, str]:
+def _fit_largest_plane(points: Float, normals: Float, up: Float) -> tuple[Float, str]:
     """Normal of the plane across `up` with most points; `up` where it is small."""
     for _ in range(_MAX_REFINEMENTS):
-        points = surfaces.points[surfaces.normals @ up > _MIN_COSINE]
-        height = points @ up
+        level_points = points[normals @ up > _MIN_COSINE]
+        height = level_points @ up
         bins = np.floor((height - height.min()) / _LAYER).astype(np.intp)
         level = height.min() + (np.bincount(bins).argmax() + 0.5) * _LAYER
-        inliers = points[np.abs(height - level) < _LAYER]
+        inliers = level_points[np.abs(height - level) < _LAYER]
         values, axes = (
             np.linalg.eigh(np.cov(inliers.T)) if len(inliers) > 3 else (np.zeros(3), np.eye(3))
         )

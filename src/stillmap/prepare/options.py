@@ -16,12 +16,15 @@ MAX_POINT_DISTANCE = 1e5  # m: beyond the reach of any sensor; damaged files hol
 
 MAX_TIME = 9e9  # s: int64 holds 9.22e9 s in nanoseconds
 
-_FULL_TURN = 2.0 * math.pi + 1e-6  # rad
+_RANGE: dict[str, float] = {"gt": 0.0, "le": MAX_PLAUSIBLE_RANGE}
+_FOV: dict[str, float] = {"gt": 0.0, "lt": 2.0 * math.pi + 1e-6}
+_TIME: dict[str, float] = {"ge": 0.0, "le": MAX_TIME}
+_UNSET, _FOUND = "unset: taken from the recording.", "unset: found in the transforms."
 
 
 def _coordinate(doc: str) -> Any:
     """An option of a laser's pose, in m or rad."""
-    return option(None, doc, gt=-1e3, lt=1e3)
+    return option(None, f"{doc}; {_UNSET}", gt=-1e3, lt=1e3)
 
 
 class LaserOptions(NamedTuple):
@@ -44,34 +47,24 @@ class ReadOptions:
     """Options of `stillmap.read`."""
 
     min_range: float = option(
-        0.0,
-        "Ignore ranges shorter than this, in metres (returns from the robot itself).",
-        ge=0.0,
-        lt=MAX_PLAUSIBLE_RANGE,
+        0.0, "Ignore shorter ranges, in metres (returns from the robot itself).", ge=0.0, lt=1e3
     )
     max_range: float | None = option(
         None,
-        "Treat ranges from this on, in metres, as maximum-range beams; unset: detected from the "
-        "readings (5 m for depth images).",
-        gt=0.0,
-        le=MAX_PLAUSIBLE_RANGE,
+        "Treat ranges from this on, in metres, as maximum-range beams; unset: detected (5 m for "
+        "depth images).",
+        **_RANGE,
     )
     zero_means: Literal["auto", "unusable", "max-range"] = option(
-        "auto",
-        "Meaning of a zero range: detected from the recording, an unusable beam, or a "
-        "maximum-range beam.",
+        "auto", "Meaning of a zero range: detected, an unusable beam, or a maximum-range beam."
     )
     free_range: float | None = option(
         None,
-        "Free space that a maximum-range beam clears, in metres; unset: the largest range at "
-        "which the laser really sees.",
-        gt=0.0,
-        le=MAX_PLAUSIBLE_RANGE,
+        "Free space that a maximum-range beam clears, in metres; unset: as far as the laser sees.",
+        **_RANGE,
     )
     self_filter: bool = option(
-        True,
-        "Remove returns from the robot itself: beams that end at the same place wherever the "
-        "robot is.",
+        True, "Remove returns from the robot itself: those at one place wherever the robot is."
     )
     spin: Literal["auto", "none", "clockwise", "counter-clockwise"] = option(
         "auto",
@@ -79,54 +72,27 @@ class ReadOptions:
         "none: all points share the stamp; auto: clockwise for raw KITTI drives, else estimated "
         "from the sweeps while mapping.",
     )
-    laser_x: float | None = _coordinate(
-        "Position of the first laser ahead of the robot's centre, in metres; unset: taken from "
-        "the recording."
-    )
-    laser_y: float | None = _coordinate(
-        "Position of the first laser left of the robot's centre, in metres; unset: taken from "
-        "the recording."
-    )
-    laser_theta: float | None = _coordinate(
-        "Yaw of the first laser on the robot, in radians; unset: taken from the recording."
-    )
-    laser_upside_down: bool | None = option(
-        None,
-        "Whether the first laser hangs upside down (beams in reverse order); unset: taken from "
-        "the recording.",
-    )
+    laser_x: float | None = _coordinate("First laser ahead of the robot's centre, in metres")
+    laser_y: float | None = _coordinate("First laser left of the robot's centre, in metres")
+    laser_theta: float | None = _coordinate("Yaw of the first laser on the robot, in radians")
+    laser_upside_down: bool | None = option(None, f"The first laser hangs upside down; {_UNSET}")
     laser_fov: float | None = option(
         None,
-        "Field of view of the first laser, in radians, for CARMEN lines without angles; unset: pi.",
-        gt=0.0,
-        lt=_FULL_TURN,
+        "Field of view of the first laser, rad, for CARMEN lines without angles; unset: pi.",
+        **_FOV,
     )
-    laser2_x: float | None = _coordinate(
-        "Position of the second laser ahead of the robot's centre, in metres."
-    )
-    laser2_y: float | None = _coordinate(
-        "Position of the second laser left of the robot's centre, in metres."
-    )
-    laser2_theta: float | None = _coordinate("Yaw of the second laser on the robot, in radians.")
-    laser2_upside_down: bool | None = option(
-        None, "Whether the second laser hangs upside down (beams in reverse order)."
-    )
-    laser2_fov: float | None = option(
-        None, "Field of view of the second laser, in radians.", gt=0.0, lt=_FULL_TURN
-    )
+    laser2_x: float | None = _coordinate("Second laser ahead of the robot's centre, in metres")
+    laser2_y: float | None = _coordinate("Second laser left of the robot's centre, in metres")
+    laser2_theta: float | None = _coordinate("Yaw of the second laser on the robot, in radians")
+    laser2_upside_down: bool | None = option(None, f"The second laser hangs upside down; {_UNSET}")
+    laser2_fov: float | None = option(None, "Field of view of the second laser, rad.", **_FOV)
     start: float | None = option(
         None,
         "Leave out scans before this time, in seconds from the first scan; from 1e8 on a stamp in "
         "seconds; unset: none.",
-        ge=0.0,
-        le=MAX_TIME,
+        **_TIME,
     )
-    end: float | None = option(
-        None,
-        "Leave out scans after this time, in seconds likewise; unset: none.",
-        ge=0.0,
-        le=MAX_TIME,
-    )
+    end: float | None = option(None, "Leave out scans after this time, likewise.", **_TIME)
     cameras: str | None = option(
         None, "TOML file with camera calibrations that the recording lacks, and further images."
     )
@@ -140,12 +106,8 @@ class ReadOptions:
     tilting_topic: str | None = option(
         None, "Scan topic of a tilting laser in a bag, used for the 3D cloud only."
     )
-    base_frame: str | None = option(
-        None, "Base frame of the robot in a bag; unset: found in the transforms."
-    )
-    odom_frame: str | None = option(
-        None, "Odometry frame in a bag; unset: found in the transforms."
-    )
+    base_frame: str | None = option(None, f"Base frame of the robot in a bag; {_FOUND}")
+    odom_frame: str | None = option(None, f"Odometry frame in a bag; {_FOUND}")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

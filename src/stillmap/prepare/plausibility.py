@@ -77,7 +77,11 @@ def leave_out_far_returns(
         resolution, max_range: as of `mapped_range`.
     """
     reach = mapped_range(recording.dimension, resolution, max_range)
-    far = _find_far(recording, reach)
+    blocks = [np.zeros(0, np.intp)]
+    for block in arrays.iter_blocks(recording.points):
+        squared = arrays.squared_lengths(recording.points[block])
+        blocks.append(np.flatnonzero(squared > reach * reach) + block.start)
+    far = np.concatenate(blocks)
     if not len(far):
         return recording, []
     points = arrays.copy(recording.points, recording.scratch)
@@ -90,7 +94,15 @@ def leave_out_far_returns(
         length = np.linalg.norm(points[free].astype(np.float64), axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):  # infinite ones become NaN
             points[free] = (points[free] * (limit / length)).astype(np.float32)
-    return kept, [_sentence(recording, len(returns), len(free), reach)]
+    if not len(returns):
+        beams = f"{len(free)} beam{'s' * (len(free) > 1)} without a return"
+        where = f"beyond {reach:.4g} m, where nothing is mapped"
+        return kept, [f"{beams} would show free space {where}: shortened"]
+    cells = "slam.resolution" if recording.dimension == 2 else "slam.voxel_size"
+    option = "read.max_range" if reach < MAX_PLAUSIBLE_RANGE else f"a coarser {cells}"
+    total = int(np.count_nonzero(recording.hit))
+    what = f"{len(returns)} of {total} returns are farther than {reach:.4g} m: they are not used"
+    return kept, [advise(what, f"if the sensor reaches that far, say so by {option}")]
 
 
 def shorten_far_beams(points: Float32, hit: Bool, reach: float) -> tuple[Float32, Bool]:
@@ -109,15 +121,6 @@ def shorten_far_beams(points: Float32, hit: Bool, reach: float) -> tuple[Float32
     return (points * scale[:, None]).astype(np.float32), hit & ~far
 
 
-def _find_far(recording: Recording, reach: float) -> Index:
-    """Beams longer than `reach` m."""
-    far = [np.zeros(0, np.intp)]
-    for block in arrays.iter_blocks(recording.points):
-        squared = arrays.squared_lengths(recording.points[block])
-        far.append(np.flatnonzero(squared > reach * reach) + block.start)
-    return np.concatenate(far)
-
-
 def _longest_return(recording: Recording) -> float:
     """Length of the longest return, m; 0: there is none."""
     longest = 0.0
@@ -125,21 +128,6 @@ def _longest_return(recording: Recording) -> float:
         squared = arrays.squared_lengths(recording.points[block])
         longest = max(longest, float(squared[recording.hit[block]].max(initial=0.0)))
     return math.sqrt(longest)
-
-
-def _sentence(recording: Recording, returns: int, free: int, reach: float) -> str:
-    if not returns:
-        return (
-            f"{free} beam{'s' * (free > 1)} without a return would show free space beyond "
-            f"{reach:.4g} m, where nothing is mapped: shortened"
-        )
-    cells = "slam.resolution" if recording.dimension == 2 else "slam.voxel_size"
-    option = "read.max_range" if reach < MAX_PLAUSIBLE_RANGE else f"a coarser {cells}"
-    total = int(np.count_nonzero(recording.hit))
-    return advise(
-        f"{returns} of {total} returns are farther than {reach:.4g} m: they are not used",
-        f"if the sensor reaches that far, say so by {option}",
-    )
 
 
 def remove_leaps(recording: Recording) -> tuple[Recording, list[str]]:

@@ -6,11 +6,11 @@ That scans were taken at different positions shows, without poses, in range prof
 obstacles between ground and ceiling.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
@@ -109,10 +109,10 @@ def find_self_mask(recording: Recording, sensor: int) -> SelfMask | None:
         return None
     scans = scans[np.unique(np.linspace(0, len(scans) - 1, _MAX_SCANS).astype(np.intp))]
     samples = [sample_hits(recording, scan, R) for scan in recording.iter_scans(scans.tolist())]
-    planes = fit_ground_and_ceiling(np.concatenate([sample.points for sample in samples]))
-    if planes is None or not any(is_3d_sweep(sample.points) for sample in samples):
+    planes = fit_ground_and_ceiling(np.concatenate(samples))
+    if planes is None or not any(map(is_3d_sweep, samples)):
         return None
-    distinct = select_distinct_scans(samples, planes)
+    distinct = select_distinct_scans(scans.tolist(), samples, planes)
     if len(distinct) < MIN_SCANS:
         return None
     # distinct scans may lie close together, as where the robot turns round in a niche
@@ -134,10 +134,8 @@ def _keep_near_sensor(cells: Bool) -> Bool:
 
     A car that drives alongside at the same speed is constant for a while, too.
     """
-    import scipy  # its parts load when they are first used
-
     dilated = scipy.ndimage.binary_dilation(cells, np.ones((3, 3, 3), np.bool_))
-    components, count = scipy.ndimage.label(dilated, np.ones((3, 3, 3)))
+    components, count = scipy.ndimage.label(dilated, np.ones((3, 3, 3), np.bool_))
     middle = _CELL * (np.arange(len(cells)) + 0.5) - BODY_RADIUS
     near = np.hypot(middle[:, None], middle[None, :]) < _MAX_GAP_TO_SENSOR
     kept = np.zeros(count + 1, np.bool_)
@@ -168,16 +166,6 @@ def _is_within(points: NDArray[np.floating[Any]], distance: float) -> Bool:
     return np.asarray((np.abs(x) < distance) & (np.abs(y) < distance) & (np.abs(z) < distance))
 
 
-def _dilate(cells: Bool, axes: Iterable[int]) -> Bool:
-    """Cells and their neighbours along some axes."""
-    for axis in axes:
-        out, before = np.moveaxis(cells.copy(), axis, 0), np.moveaxis(cells, axis, 0)
-        out[1:] |= before[:-1]
-        out[:-1] |= before[1:]
-        cells = np.moveaxis(out, 0, axis)
-    return cells
-
-
 def _find_constant_cells(recording: Recording, scans: list[int], R: Float) -> Bool:
     """(n, n, n) mask of cells with returns in nearly all scans."""
     n = round(2 * BODY_RADIUS / _CELL)
@@ -188,7 +176,7 @@ def _find_constant_cells(recording: Recording, scans: list[int], R: Float) -> Bo
         occupied = np.zeros((n, n, n), np.bool_)
         occupied[tuple(_cell_indices(points, _CELL).T)] = True
         in_cell += occupied
-        near_cell += _dilate(occupied, (0, 1, 2))
+        near_cell += scipy.ndimage.binary_dilation(occupied, np.ones((3, 3, 3), np.bool_))
     return np.asarray(
         (near_cell >= _MIN_SHARE_NEAR * len(scans)) & (in_cell >= _MIN_SHARE_IN_CELL * len(scans))
     )
@@ -219,7 +207,7 @@ def _extended_profile(along: Float, across: Float) -> Bool:
     filled = np.zeros((2, metres, m, m), np.bool_)
     side = (along[inside] < 0).astype(np.intp)
     filled[(side, metre, *_cell_indices(across[inside], _PROFILE_CELL).T)] = True
-    filled = _dilate(filled, (2, 3))
+    filled = scipy.ndimage.binary_dilation(filled, np.ones((1, 1, 3, 3), np.bool_))
     return np.asarray((filled.sum(axis=1) >= _MIN_EXTENSION[0]).any(axis=0))
 
 
@@ -237,19 +225,12 @@ def _bounding_box(cells: Bool) -> tuple[Any, Any]:
     return tuple(np.round(low, 3).tolist()), tuple(np.round(high, 3).tolist())
 
 
-class ScanSample(NamedTuple):
-    """A scan number and a subset of its hits (n, 3), rotated to the axes of the robot."""
-
-    scan: int
-    points: Float32
-
-
-def sample_hits(recording: Recording, scan: int, R: Float) -> ScanSample:
-    """Sample the hits of a scan, rotated by R (3, 3)."""
+def sample_hits(recording: Recording, scan: int, R: Float) -> Float32:
+    """A subset of the hits (n, 3) of a scan, rotated by R (3, 3) to the axes of the robot."""
     beams = recording.beams_of(scan)
     points = recording.points[beams][recording.hit[beams]]
     points = points[:: max(1, len(points) // _MAX_POINTS)]
-    return ScanSample(scan, (points @ R.T).astype(np.float32))
+    return (points @ R.T).astype(np.float32)
 
 
 def is_3d_sweep(points: Float32) -> bool:
@@ -294,13 +275,13 @@ def _fit_level_plane(points: Float) -> Float | None:
     return plane
 
 
-def select_distinct_scans(samples: list[ScanSample], planes: Planes) -> list[int]:
+def select_distinct_scans(scans: list[int], samples: list[Float32], planes: Planes) -> list[int]:
     """Select scans whose range profile differs from the one before; [] where all look alike."""
     selected: list[tuple[int, Float]] = []
-    for sample in samples:
-        profile = _range_profile(sample.points, planes)
+    for scan, points in zip(scans, samples, strict=True):
+        profile = _range_profile(points, planes)
         if not selected or _is_other_position(selected[-1][1], profile):
-            selected.append((sample.scan, profile))
+            selected.append((scan, profile))
     # a standing robot sees changing people in front of constant walls
     stacked = np.stack([profile for _, profile in selected])
     known = np.count_nonzero(np.isfinite(stacked), axis=0) >= _MIN_KNOWN * len(selected)

@@ -98,9 +98,8 @@ class TimeWindow:
             return
         assert self.first_ns is not None
         assert self.last_ns is not None
-        wanted = ([] if self._start is None else [f"from {self._start:.10g} s"]) + (
-            [] if self._end is None else [f"to {self._end:.10g} s"]
-        )
+        limits = (("from", self._start), ("to", self._end))
+        wanted = [f"{word} {at:.10g} s" for word, at in limits if at is not None]
         first, last = format_seconds(self.first_ns), format_seconds(self.last_ns)
         span = (self.last_ns - self.first_ns) / 1e9
         hint = f"the recording spans 0 to {span:.2f} s, stamps {first} to {last}"
