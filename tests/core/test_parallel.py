@@ -13,14 +13,6 @@ def test_outcomes_keep_the_order_of_the_items(threads):
     assert list(map_ordered(str, [], threads)) == []
 
 
-def test_one_thread_does_work_when_it_is_asked_for():
-    order = []
-    with work_beside(lambda: order.append("work"), 1) as done:
-        order.append("block")
-        done()
-    assert order == ["block", "work"]
-
-
 @pytest.mark.parametrize("threads", [1, 2])
 def test_errors_of_work_beside_are_raised_where_it_is_asked_for(threads):
     with work_beside(lambda: 1 // 0, threads) as done, pytest.raises(ZeroDivisionError):
@@ -39,19 +31,6 @@ def test_items_are_asked_for_when_they_are_due(threads):
     outcomes = map_ordered(lambda i: i, items(), threads)
     assert next(outcomes) == 0
     assert len(asked) <= threads + 1
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_what_goes_wrong_is_told(threads):
-    def work(i):
-        if i == 3:
-            raise ValueError("the third")
-        return i
-
-    outcomes = map_ordered(work, range(10), threads)
-    assert [next(outcomes) for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(ValueError, match="the third"):
-        next(outcomes)
 
 
 def blas_threads():

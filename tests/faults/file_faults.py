@@ -37,19 +37,7 @@ def be_device(path: Path) -> None:
     path.symlink_to("/dev/zero")
 
 
-def be_of_proc(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/proc/kmsg" if os.access("/proc/kmsg", os.R_OK) else "/proc/self/mem")
-
-
-def be_one_of_many(path: Path) -> None:
-    """10 000 files beside it, with its ending."""
-    ending = "".join(path.suffixes[-2:])
-    for number in range(10_000):
-        (path.parent / f"{number:06d}{ending}").touch()
-
-
-BEFORE = (be_empty, be_folder, be_pipe, be_loop, be_device, be_of_proc, be_one_of_many)
+BEFORE = (be_empty, be_folder, be_pipe, be_loop, be_device)
 
 
 # what is done to it once something of it has been read

@@ -10,7 +10,7 @@ for needed in ("pye57", "laspy", "lazrs", "lzf"):
     pytest.importorskip(needed)
 
 from faulty_inputs import RECORDINGS, Reader  # noqa: E402
-from file_faults import BEFORE, MEANWHILE, be_one_of_many, run, while_read  # noqa: E402
+from file_faults import BEFORE, MEANWHILE, run, while_read  # noqa: E402
 
 from stillmap.cli.main import main  # noqa: E402
 
@@ -21,7 +21,7 @@ def rows(faults: tuple[Callable[[Path], None], ...]) -> list[object]:
             reader,
             fault,
             id=f"{reader.name.replace('/', '-')}-{fault.__name__}",
-            marks=() if reader.is_quick and fault not in (be_one_of_many,) else pytest.mark.slow,
+            marks=() if reader.is_quick else pytest.mark.slow,
         )
         for reader in RECORDINGS
         for fault in faults

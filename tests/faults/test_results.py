@@ -11,7 +11,7 @@ for needed in ("pye57", "laspy", "lazrs", "lzf"):  # of other inputs
     pytest.importorskip(needed)
 
 from faulty_inputs import Reader  # noqa: E402
-from file_faults import BEFORE, MEANWHILE, be_one_of_many, be_pipe, run, while_read  # noqa: E402
+from file_faults import BEFORE, MEANWHILE, be_pipe, run, while_read  # noqa: E402
 
 from stillmap.cli.main import main  # noqa: E402
 from stillmap.pipeline import result as result_module  # noqa: E402
@@ -95,7 +95,7 @@ def rows(faults: tuple[Callable[..., None], ...]) -> list[object]:
             Reader(victim, lambda home: home, victim, command),
             fault,
             id=f"{command.__name__}-{victim.replace('/', '-')}-{fault.__name__}",
-            marks=() if victim in QUICK and fault is not be_one_of_many else pytest.mark.slow,
+            marks=() if victim in QUICK else pytest.mark.slow,
         )
         for command, victims in COMMANDS.items()
         for victim in victims
@@ -168,11 +168,7 @@ def checkpoint(interrupted, tmp_path) -> Path:
 )
 @pytest.mark.parametrize(
     "fault",
-    [
-        pytest.param(one, marks=() if one is be_pipe else pytest.mark.slow)
-        for one in BEFORE
-        if one is not be_one_of_many
-    ],
+    [pytest.param(one, marks=() if one is be_pipe else pytest.mark.slow) for one in BEFORE],
 )
 def test_checkpoint_with_fault(checkpoint, tmp_path, capsys, name, fault):
     fault(checkpoint / name)

@@ -100,19 +100,6 @@ def test_stopped_and_continued(start, recordings, by_hand, tmp_path, number):
 
 
 @pytest.mark.slow
-def test_sessions_of_one_place_are_merged(start, recordings, tmp_path):
-    out = tmp_path / "out"
-    process = start("fleet", recordings, "-o", out, "--merge", "--json", "--quiet")
-    printed, err = process.communicate(timeout=300)
-    assert process.returncode in (0, 3), err
-    (why,) = {one["place_why"] for one in json.loads(printed)}
-    if process.returncode == 0:
-        assert (out / "places/all/sessions.json").is_file()
-    else:
-        assert why
-
-
-@pytest.mark.slow
 def test_workers_of_a_scheduler(recordings, by_hand, start, tmp_path):
     """One of two workers is killed in the midst: the work is done all the same."""
     out, settings = tmp_path / "out", {"n_workers": 2, "threads_per_worker": 1}
