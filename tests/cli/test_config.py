@@ -1,14 +1,16 @@
 """`stillmap config`, and the precedence of options: default < file < --set < flag."""
 
 import json
+import math
 import tomllib
 
 import pytest
 
 from stillmap.cli.arguments import options_from_args
+from stillmap.cli.console import print_json
 from stillmap.cli.main import main
 from stillmap.cli.parser import parser
-from stillmap.core.config import to_dict
+from stillmap.core.config import iter_options, to_dict
 from stillmap.pipeline.options import Options
 
 
@@ -123,3 +125,26 @@ def test_wrong_value_names_its_source(capsys, words, said):
     message = refusal(capsys, *words)
     for part in said:
         assert part in message
+
+
+def test_as_json(capsys):
+    found = json.loads(config(capsys, "--json", "--set", "em.prior=0.75"))
+    assert list(found) == [one.name for one in iter_options(Options())]
+    assert found["em.prior"] == {
+        "value": 0.75,
+        "default": Options().em.prior,
+        "type": "float",
+        "choices": None,
+        "range": "more than 0 and less than 1",
+        "doc": "Prior probability p(c = 1) that a beam is static.",
+    }
+    assert found["read.max_range"]["type"] == "float or unset"
+    assert found["output.map_state"]["choices"] == ["last", "majority", "open", "shut"]
+    assert all(one["doc"] for one in found.values())
+    odometry = json.loads(config(capsys, "slam.odometry", "--json"))
+    assert set(odometry) == {name for name in found if name.startswith("slam.odometry.")}
+
+
+def test_non_finite_becomes_null(capsys):
+    print_json({"a": [math.nan, math.inf, 1.5], "b": {"c": -math.inf}})
+    assert capsys.readouterr().out == '{"a": [null, null, 1.5], "b": {"c": null}}\n'

@@ -36,7 +36,7 @@ DATA ascii
 def mapped(stillmap, room, tmp_path_factory):
     """A finished run: its folder and what it said."""
     out = tmp_path_factory.mktemp("mapped") / "out"
-    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=2")
+    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=2", "--json")
     assert done.returncode == 0, done.stderr
     return out, done
 
@@ -72,9 +72,18 @@ def test_run_json(mapped):
     assert set(run["seconds"]) == set(run["cpu_seconds"]) == set(run["peak_memory_bytes"])
 
 
+def test_summary_as_json(mapped):
+    out, done = mapped
+    found, record = json.loads(done.stdout), json.loads((out / "run.json").read_text())
+    assert found["output"] == str(out)
+    assert set(found["files"]) == list_files(out)
+    assert found["iterations"] == len(record["iterations"])
+    for key in ("counts", "converged", "best_iteration", "warnings", "seconds", "area"):
+        assert found[key] == record[key], key
+
+
 def test_progress_lines_without_terminal(mapped):
     _, done = mapped
-    assert done.stdout == ""
     lines = done.stderr.splitlines()
     assert all(line.startswith("stillmap: ") for line in lines)
     assert sum("iteration 1/2" in line for line in lines) == 1
