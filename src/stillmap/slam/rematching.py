@@ -130,14 +130,10 @@ def _rematch(window: Recording, poses: Float, threads: int) -> Float:
     e = np.full(window.n_beams, _P_STATIC, np.float32)
     options = SlamOptions(resolution=_RESOLUTION)
     if window.dimension == 2:
-        found, normalize = _match_scans(window, e, options), se2.normalize
-    else:
-        odometry = register_sweeps(
-            window, e, options.odometry, _no_progress, threads, max_points=_MAX_POINTS
-        )
-        found = odometry.poses
-        normalize = se3.normalize
-    return normalize(poses[0] @ se2.inverse(found[0]) @ found)
+        found = _match_scans(window, e, options)
+        return se2.normalize(poses[0] @ se2.inverse(found[0]) @ found)
+    sweeps = register_sweeps(window, e, options.odometry, lambda *_: None, threads, _MAX_POINTS)
+    return se3.normalize(poses[0] @ se2.inverse(sweeps.poses[0]) @ sweeps.poses)
 
 
 def _match_scans(window: Recording, e: Float32, options: SlamOptions) -> Float:
@@ -162,7 +158,3 @@ def _match_scans(window: Recording, e: Float32, options: SlamOptions) -> Float:
         found[t] = match.T_map_base
         local_map.add(t, found[t], 0.0)
     return found
-
-
-def _no_progress(done: int, total: int) -> None:
-    """Nobody waits for the scans of a window."""

@@ -13,6 +13,7 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
+from stillmap.mapping.changed_objects import cell_keys
 from stillmap.tracking.association import ACCELERATION
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
@@ -86,7 +87,7 @@ def explain_hits(
     beam, path, weight = on_movers
     if not len(beam):
         return p_static
-    key = _keys(recording.end_points(beam, poses))
+    key = cell_keys(np.floor(recording.end_points(beam, poses) / _CELL).astype(np.int64))
     places, place = np.unique(key, return_inverse=True)
     explained = np.bincount(place, weight, minlength=len(places)).astype(np.float64)
     others = _static_hits(recording, poses, p_static, places)
@@ -171,17 +172,11 @@ def _static_hits(recording: Recording, poses: Float, p_static: Float32, places: 
     out = np.zeros(len(places))
     for block in arrays.iter_blocks(recording.hit, p_static):
         beam = block.start + np.flatnonzero(recording.hit[block] & ~np.isnan(p_static[block]))
-        key = _keys(recording.end_points(beam, poses))
+        key = cell_keys(np.floor(recording.end_points(beam, poses) / _CELL).astype(np.int64))
         at = np.minimum(np.searchsorted(places, key), len(places) - 1)
         found = places[at] == key
         out += np.bincount(at[found], p_static[beam[found]], minlength=len(places))
     return out
-
-
-def _keys(xy: Float) -> Int64:
-    """(n,) one key per square of the plane."""
-    square = np.floor(xy / _CELL).astype(np.int64)
-    return np.asarray((square[:, 0] << 32) + square[:, 1], np.int64)
 
 
 _MIN_P_MOVER = 0.99  # what explains hits must be certain: clutter would make more of itself

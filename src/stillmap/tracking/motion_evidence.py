@@ -19,6 +19,7 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import group_indices
 from stillmap.em.shape_evidence import find_lost_beams
 from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
@@ -276,9 +277,7 @@ def _classify_visibility(
         T_map_sensor: (T, 3, 3) sensor poses.
     """
     out = np.full(len(scan), Visibility.HIDDEN, np.intp)
-    order = np.argsort(scan, kind="stable")
-    cuts = np.flatnonzero(np.diff(scan[order])) + 1
-    groups = np.split(order, cuts) if len(order) else []
+    groups = group_indices(scan)
     for g in recording.iter_scans(range(len(groups))):
         here = groups[g]
         t = int(scan[here[0]])
