@@ -30,6 +30,7 @@ from stillmap.tracking.explained_hits import (
     find_mover_hits,
     fit_share,
     iterate_walker_paths,
+    log_beta,
 )
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath
@@ -171,9 +172,7 @@ def compute_log_ratio(e: TrackEvidence) -> Float:
 
 def _log_mean_power(successes: Float, failures: Float, a: float, b: float) -> Float:
     """(K,) ln of the mean of q^successes (1 - q)^failures over q from Beta(a, b)."""
-    from scipy.special import betaln  # slow to load
-
-    return np.asarray(betaln(successes + a, failures + b) - betaln(a, b))
+    return log_beta(successes + a, failures + b) - log_beta(a, b)
 
 
 def collect_evidence(
