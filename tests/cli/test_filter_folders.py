@@ -32,6 +32,21 @@ def test_kitti_folder(call, tmp_path, layout, times):
     assert check_same_but(recording, tmp_path / "clean", blank).n_scans == 3
 
 
+@pytest.mark.parametrize("linked", ["labels", "labels/000001.label"])
+def test_linked_labels_of_the_source_stay(call, tmp_path, linked):
+    source = kitti(tmp_path / "drive")
+    (tmp_path / "truth").mkdir()
+    (source / linked).rename(tmp_path / "truth/given")
+    (source / linked).symlink_to(tmp_path / "truth/given")
+    recording, blank = label(source, tmp_path / "out")
+    before = files(tmp_path / "truth")
+    run(call, tmp_path / "out", tmp_path / "clean")
+    assert files(tmp_path / "truth") == before
+    after = (tmp_path / "clean/labels/000001.label").read_bytes()
+    assert len(after) == 4 * (~blank[recording.beams_of(1)]).sum()
+    assert (tmp_path / "clean/labels/000003.label").read_bytes() == b"of other points"
+
+
 @pytest.mark.parametrize("output", ["clean.ply", "clean:pcd"])
 def test_clouds_without_poses_get_those_of_the_map(call, tmp_path, output):
     source = kitti(tmp_path / "drive")

@@ -115,9 +115,11 @@ def write_kitti(job: FilterJob) -> Omissions:
         _copy_table(kitti.scan_layout(path), new, mask)
         labels = job.source / "labels" / f"{path.stem}.label"
         if labels.is_file() and labels.stat().st_size == _LABEL * len(mask):
-            folder = new.parents[len(path.relative_to(job.source).parts) - 1]
+            folder = new.parents[len(path.relative_to(job.source).parts) - 1] / "labels"
             values = np.frombuffer(labels.read_bytes(), f"V{_LABEL}")[~mask]
-            (folder / "labels" / labels.name).write_bytes(values.tobytes())
+            _replace_link(folder)  # through links the source would be written
+            (folder / labels.name).unlink()
+            (folder / labels.name).write_bytes(values.tobytes())
 
     files = kitti.list_scans(job.source)
     return _write_files(job, files, filter_file, write_unread=lambda _, new: new.touch())
@@ -211,6 +213,16 @@ def _copy_others(
             _copy_others(entry, new, files, omit)
         elif entry.is_file():
             copy_file(entry, new)
+
+
+def _replace_link(folder: Path) -> None:
+    """Replace a link to a folder by a folder of links to what that holds."""
+    if folder.is_symlink():
+        entries = list(folder.resolve().iterdir())
+        folder.unlink()
+        folder.mkdir()
+        for entry in entries:
+            (folder / entry.name).symlink_to(entry)
 
 
 def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:
