@@ -234,22 +234,6 @@ def test_scans_are_labelled_once_more_after_the_lag(corridor):
     assert 0 < wrong["later"] < 0.9 * wrong["at once"]
 
 
-def test_an_earlier_scan_is_labelled_as_it_was(corridor):
-    """Where scans are a millisecond apart, as those of two lasers, poses do not tell the motion."""
-    n = len(corridor.beams[0].points)
-    times = np.linspace(0.0, 0.1, n, dtype=np.float32)
-    with LiveMapper({"threads": 1}) as mapper:
-        for t, beams in enumerate(corridor.beams[:60]):
-            odometry = corridor.recording.T_odom_base[t]
-            mapper.push(replace(beams, sensor="other"), odometry)
-            last = replace(beams, stamp_ns=beams.stamp_ns + 10**6, beam_time=times)
-            update = mapper.push(last, odometry)
-        twist = mapper._slam.history.answer(2 * t + 1)["twist"]
-        again = mapper.label(last, 2 * t + 1)
-    np.testing.assert_allclose(twist, 0.0, atol=1e-6)
-    assert np.mean((again < 0.5) == (update.p_static < 0.5), where=last.hit) > 0.95
-
-
 @pytest.mark.parametrize("settings", [{"max_scratch": 0}, {"max_scratch": 1000}, {"lag": 0.0}])
 def test_wrong_bounds_are_named(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):

@@ -10,9 +10,6 @@ from stillmap.core import se2
 from stillmap.live import local_map as module
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.scan import to_beams
-from stillmap.live.scan_odometry import select_hits
-from stillmap.slam.motion_model import gaussian_prior
-from stillmap.slam.scan_matching import refine_pose
 
 ANGLES = np.linspace(-2.0, 2.0, 90)
 
@@ -105,12 +102,3 @@ def test_new_labels_are_those_of_a_scan_that_is_added_anew():
     for cells in (maps[0].grid.block_cells, maps[1].grid.block_cells):
         every = (cells[:, None] + np.argwhere(np.ones((32, 32)))).reshape(-1, 2)
         np.testing.assert_array_equal(*(one.grid.alpha_beta(every) for one in maps))
-    pose = scan_matching_pose(maps)
-    np.testing.assert_array_equal(*pose)
-
-
-def scan_matching_pose(maps):
-    """The poses that the end points have in two maps, by their means, too."""
-    prior = gaussian_prior(se2.matrix(1.32, -0.41, 0.69), 0.1, 0.1)
-    hits = select_hits(to_beams(stillmap.Scan(0.0, np.full(90, 4.0), ANGLES)))
-    return [refine_pose(one.grid, hits, prior, prior.T_map_base).T_map_base for one in maps]

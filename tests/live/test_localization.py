@@ -85,25 +85,6 @@ def test_a_crowd_does_not_lose_it(hall):
     assert np.mean(found) < 0.06
 
 
-@pytest.mark.slow
-def test_scans_from_before_it_was_found_are_labelled_in_the_map(hall):
-    simulation = hall.simulate(201, crowd={"people": 10})
-    beams = list(iter_beams(simulation.recording))
-    for first in range(100, 1600, 250):  # at some places one scan is enough
-        answers = run(hall, simulation, range(first, first + 40))
-        k, update, mapper = next(answers)
-        while "lost" in update.doubts:
-            k, update, mapper = next(answers)
-        if k > first:
-            break
-    assert k > first
-    labels, hit = mapper.label(beams[first], 0), beams[first].hit
-    in_map = mapper._slam.labels.label(beams[first], mapper.poses[0])
-    np.testing.assert_array_equal(labels, in_map)
-    static = simulation.truth.static[simulation.recording.beams_of(first)]
-    assert np.mean((labels >= 0.5) == static, where=hit) > 0.9
-
-
 def test_a_robot_that_is_carried_is_found_again(hall):
     robot = {"scans": 220, "carried_at": 0.4, "carried_time": 5.0}
     simulation = hall.simulate(203, crowd={"people": 5}, robot=robot)

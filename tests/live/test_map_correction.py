@@ -1,7 +1,6 @@
 """A correction that is applied in parts counts no evidence twice, and none is lost."""
 
 import numpy as np
-import pytest
 
 import stillmap
 from stillmap.core import se2
@@ -73,15 +72,3 @@ def test_evidence_is_counted_once():
     assert len(both) > 1000
     off = np.abs(both[:, 0] - both[:, 1])
     assert np.mean(off > 0.02) < 0.02
-
-
-@pytest.mark.parametrize("time_bin", [2, 3])
-def test_a_scan_that_is_added_again_changes_nothing(time_bin):
-    """Its time bin is not open any more, but in cells that nobody saw since."""
-    labels = make_labels([look(k) for k in range(6)])
-    before = states(labels)
-    labels.add(look(time_bin), look(time_bin).T)
-    after = states(labels)
-    assert before.keys() == after.keys()
-    off = [abs(before[cell] - after[cell]) for cell in before]
-    assert np.mean(np.array(off) > 1e-6) < 0.01

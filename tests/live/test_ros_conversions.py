@@ -33,12 +33,6 @@ def test_limits_of_the_parameters():
     np.testing.assert_allclose(length, [NAN, 5.0, 3.0], rtol=1e-6)
 
 
-def test_a_laser_upside_down_turns_the_other_way():
-    message = laser_scan(1, [2.0, 2.0])
-    beams = messages.to_scan_beams(message, "scan", Mount(np.eye(3), is_upside_down=True))
-    np.testing.assert_allclose(np.arctan2(beams.points[:, 1], beams.points[:, 0]), [1.0, 0.9])
-
-
 @pytest.mark.parametrize(
     ("increment", "times"), [(0.01, [0.0, 0.01, 0.02]), (0.0, None), (1.0, None), (-0.1, None)]
 )

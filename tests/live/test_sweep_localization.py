@@ -13,7 +13,6 @@ from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
-from stillmap.live.sweep_view import _trace_low
 from stillmap.sim import scene_by_name, simulate
 
 LIDAR = {"channels": 16, "columns": 240}
@@ -148,16 +147,3 @@ def test_where_nothing_stands_there_is_nothing_to_search(place):
         update = mapper.push(sky)
     assert "lost" in update.doubts
     assert "ambiguous" not in update.doubts
-
-
-def test_only_beams_that_run_low_show_free_space():
-    class Flat:
-        def height_at(self, xy):
-            return np.zeros(len(xy))
-
-    start = np.array([0.0, 0.0, 1.6])
-    ground, over_a_car = np.array([[8.0, 0.0, 0.0]]), np.array([[8.0, 0.0, 1.5]])
-    x = _trace_low(start, ground, Flat(), 0.1)[:, 0]
-    assert 5.0 < x.min() < 5.1  # 0.6 m high
-    assert 7.7 < x.max() < 7.85
-    assert not len(_trace_low(start, over_a_car, Flat(), 0.1))
