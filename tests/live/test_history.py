@@ -61,8 +61,7 @@ def test_the_drive_is_a_recording_while_it_lasts(corridor, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "lost", "scans"),
-    [("offset", 3, -1), ("stamp_ns", 8, -1), ("points", 1, -1)],
+    ("name", "lost", "scans"), [("offset", 3, -1), ("stamp_ns", 8, -1), ("points", 1, -1)]
 )
 def test_half_a_scan_is_left_out(corridor, tmp_path, name, lost, scans):
     with LiveMapper({"threads": 1}, folder=tmp_path / "drive") as mapper:

@@ -20,11 +20,7 @@ FIRST = 60  # sweep at which the robot is switched on
 
 
 def run_through_hall(seed, people, scans):
-    changes = {
-        "lidar": LIDAR,
-        "robot": {"scans": scans, "speed": 2.0},
-        "crowd": {"people": people},
-    }
+    changes = {"lidar": LIDAR, "robot": {"scans": scans, "speed": 2.0}, "crowd": {"people": people}}
     return simulate(scene_by_name("hall", changes), seed)
 
 
