@@ -29,7 +29,7 @@ from stillmap.em import OccupancyMap
 from stillmap.io import stillmap_folder
 from stillmap.io.point_cloud.ply import read_layout
 from stillmap.live.known_cloud import KnownCloud
-from stillmap.live.known_map import KeptCloud, KeptMap, KnownMap, extend_map, write_extended_cloud
+from stillmap.live.known_map import KeptMap, KnownMap, extend_map, write_extended_cloud
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.results.point_cloud import (
@@ -176,8 +176,8 @@ def test_it_can_be_extended_again(rooms, drive):
     off = np.linalg.norm(before[:, None] - once.poses[None, :, :3, 3], axis=2).min(axis=1)
     assert off.max() < 1.0
     kept = once.keep(None, 1.0, EDGE, (0.2, 1.8))
-    assert len(kept.cloud.points) == len(once.points)
-    assert len(kept.cloud.route) < len(once.poses)
+    assert len(kept.points) == len(once.points)
+    assert len(kept.route) < len(once.poses)
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def test_it_is_found_again_in_what_was_added(rooms):
     assert not lost[-1]
     assert max(off[-5:]) < 0.15
     # what was seen before it was carried is still known
-    assert is_of(to_world(first, kept.cloud.points), GONE).sum() <= 5
+    assert is_of(to_world(first, kept.points), GONE).sum() <= 5
     assert (shown[:, 0] > DOOR + 5.0).sum() > 100
     assert is_of(shown, CAME).sum() > 5
 
@@ -226,8 +226,9 @@ def test_clouds_far_from_the_origin_are_joined(tmp_path):
     (tmp_path / "live").mkdir()
     points = utm + np.array([[0.02, 0.01, 0.0], [0.02, 40.003, 0.0]])
     p_static, route = np.array([0.9, 0.7], np.float32), np.eye(4)[None]
-    cloud = KeptCloud(points, p_static, route, np.zeros((1, 1), bool))
-    write_extended_cloud(tmp_path, cloud, EDGE)
+    grid, cells = GridMap(np.zeros((1, 1), np.float32), (0.0, 0.0, 0.0), EDGE), np.zeros((1, 1))
+    kept = KeptMap(grid, cells, cells > 0.0, points, p_static, route)
+    write_extended_cloud(tmp_path, kept, EDGE)
     (block,) = cloud_from_folder(tmp_path, "static").iter_blocks()
     expected = utm + np.array([[0.01, 0.0, 0.0], [0.02, 40.003, 0.0]])
     np.testing.assert_array_equal(block.points, expected)
@@ -242,7 +243,5 @@ def test_cells_that_were_looked_over_stay_occupied():
     known = GridMap(np.array([[0.9, 0.9]], np.float32), (0.0, 0.0, 0.0), 1.0)
     seen = OccupancyMap(np.array([[0.1, 0.1]], np.float32), (0.0, 0.0, 0.0), 1.0, zeros, zeros)
     assert extend_map(KeptMap(known, zeros), seen).p_occupied.max() < 0.2
-    none = np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros((0, 4, 4))
-    cloud = KeptCloud(*none, np.array([[True, False]]))
-    found = extend_map(KeptMap(known, zeros, cloud), seen).p_occupied
+    found = extend_map(KeptMap(known, zeros, np.array([[True, False]])), seen).p_occupied
     np.testing.assert_allclose(found, [[0.9, 0.1]], atol=1e-6)

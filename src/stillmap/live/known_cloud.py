@@ -16,8 +16,8 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.io.trajectory import are_rigid, read_tum
-from stillmap.live.known_map import LOG_RATIO, ROUTE, KeptCloud, KeptMap, KnownMap
-from stillmap.live.sweep_view import STANDS, is_level
+from stillmap.live.known_map import LOG_RATIO, ROUTE, KeptMap, KnownMap
+from stillmap.live.sweep_view import STANDS, count_up, is_level
 from stillmap.places.evidence import cell_keys
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.slam import lidar_odometry
@@ -135,13 +135,14 @@ class KnownCloud:
         gone &= ~there & grid.occupied
         p_occupied = np.where(gone, np.float32(0.0), grid.p_occupied)
         hits[gone] = 0.0
-        cloud = KeptCloud(
+        return KeptMap(
+            replace(grid, p_occupied=p_occupied),
+            hits,
+            there & grid.occupied,
             planar.frame.points_to_map(self.points[stands]),
             self.p_static[stands],
             planar.frame.to_map(thin_route(self.poses)),
-            there & grid.occupied,
         )
-        return KeptMap(replace(grid, p_occupied=p_occupied), hits, cloud)
 
     def _columns(self, points: Float32) -> Bool:
         """(H, W) cells of the planar map in which points (N, 3) lie."""
@@ -158,9 +159,7 @@ class KnownCloud:
         height = self.ground.height_at(np.asarray((columns + 0.5) * edge, np.float64))
         first = np.ceil((height + band[0]) / edge).astype(np.int64)
         last = np.floor((height + band[1]) / edge).astype(np.int64)
-        counts = np.maximum(last - first, 0)
-        of = np.repeat(np.arange(len(columns)), counts)
-        up = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        of, up = count_up(np.maximum(last - first, 0))
         return np.column_stack([columns[of], first[of] + up])
 
     def _find_ground(self) -> GroundMap:

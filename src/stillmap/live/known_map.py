@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -38,30 +38,13 @@ _SQUARE = 2  # cells along the edge of a square of the surface map
 LOG_RATIO = 8.0  # nats by which the map speaks for static surface
 
 
-@dataclass(frozen=True, eq=False)
-class KeptCloud(ShortRepr):
-    """Points of a known cloud that are still occupied, in its map frame.
-
-    Attributes:
-        points: (N, 3) float64, m.
-        p_static: (N,) float32.
-        route: (K, 4, 4) T_map_base from where the known map was made.
-        stands: (H, W) cells of its planar map in which obstacles are among the points.
-    """
-
-    points: Float
-    p_static: Float32
-    route: Float
-    stands: Bool
-
-
-def write_extended_cloud(folder: Path, kept: KeptCloud, edge: float) -> None:
+def write_extended_cloud(folder: Path, kept: "KeptMap", edge: float) -> None:
     """Append to `static.ply` of a result what stands where this run saw no surface, and write the
     route.
 
     Args:
         folder: the result.
-        kept: of the known cloud.
+        kept: of the known map.
         edge: m, of the voxels that one of the two fills.
     """
     seen = cloud_from_folder(folder, "static")
@@ -86,12 +69,18 @@ class KeptMap(ShortRepr):
     Attributes:
         grid: the planar map.
         hits: (H, W) its sums of hits.
-        cloud: of a map in 3D, what still stands.
+        stands: of a map in 3D, (H, W) cells in which obstacles are among the points.
+        points: (N, 3) float64, m, of such a map those that are still occupied.
+        p_static: (N,) float32.
+        route: (K, 4, 4) T_map_base from where it was made.
     """
 
     grid: GridMap
     hits: NDArray[np.floating]
-    cloud: KeptCloud | None = None
+    stands: Bool | None = None
+    points: Float = field(default_factory=lambda: np.zeros((0, 3)))
+    p_static: Float32 = field(default_factory=lambda: np.zeros(0, np.float32))
+    route: Float = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
 
 def _make_room(
@@ -135,8 +124,8 @@ def extend_map(kept: KeptMap, seen: OccupancyMap) -> OccupancyMap:
     (origin, lower, upper), known = _make_room(kept.grid, seen), kept.grid.p_occupied
     p = upper(seen.p_occupied, np.nan)
     use = ~np.isnan(p)
-    if kept.cloud is not None:
-        use &= ~(lower(np.where(kept.cloud.stands, known, np.nan), np.nan) > p)
+    if kept.stands is not None:
+        use &= ~(lower(np.where(kept.stands, known, np.nan), np.nan) > p)
     return OccupancyMap(
         np.where(use, p, lower(known, np.nan)),
         origin,
@@ -152,8 +141,8 @@ def write_extended(folder: Path, kept: KeptMap, seen: OccupancyMap, mode: MapMod
     extended = extend_map(kept, seen)
     write_map_server(folder, extended, mode)
     write_map_npz(folder / "map.npz", extended)
-    if kept.cloud is not None:
-        write_extended_cloud(folder, kept.cloud, seen.resolution)
+    if kept.stands is not None:
+        write_extended_cloud(folder, kept, seen.resolution)
 
 
 class KnownMap:

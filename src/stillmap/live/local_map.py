@@ -20,7 +20,6 @@ from stillmap.slam.types import LoopContext
 
 _LABELLED_AFTER_NS = 10**9  # after which scans are labelled again
 _MAX_TRAVEL = 25.0  # m after which scans leave
-_MAX_DELAY_NS, _MAX_DELAY = 250_000_000, 1.0  # ns and m by which both may be late
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,43 +79,23 @@ class LocalMap:
         self._recent.append(scan)
         return True
 
-    def tend(self, stamp_ns: int, travelled: float, label: Labeller, most: int | None) -> None:
-        """Label scans again after a second, and remove those of long ago.
+    def tend(self, stamp_ns: int, travelled: float, label: Labeller) -> None:
+        """Label scans again after a second, each once, and remove those of long ago.
 
         Args:
             stamp_ns: now.
             travelled: m of travel so far.
             label: labels an earlier scan by what is known by now.
-            most: scans for which this is done now, unless it is overdue; None: all.
         """
-        due_ns, before = stamp_ns - _LABELLED_AFTER_NS, travelled - _MAX_TRAVEL
-        if most is not None:
-            most -= self.relabel(due_ns, label, most)
-            self.remove_before(before, most)
-            due_ns, before = due_ns - _MAX_DELAY_NS, before - _MAX_DELAY
-        self.relabel(due_ns, label)
-        self.remove_before(before)
-
-    def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
-        """Give the scans added up to then, or so many of them, the labels that are known by now,
-        each once; the number of scans."""
-        count = 0
-        while self._recent and self._recent[0].beams.stamp_ns <= until_ns and count != most:
+        while self._recent and self._recent[0].beams.stamp_ns <= stamp_ns - _LABELLED_AFTER_NS:
             self._relabel(self._recent.popleft(), label)
-            count += 1
-        return count
+        while self._scans and self._scans[0].travelled < travelled - _MAX_TRAVEL:
+            add_scan(self.grid, self._scans.popleft(), remove=True)
 
     def _relabel(self, scan: MappedScan, label: Labeller) -> None:
         at = next((k for k, mapped in enumerate(self._scans) if mapped is scan), None)
         if at is not None:
             self._scans[at] = relabel_scan(self.grid, scan, label)
-
-    def remove_before(self, travelled: float, most: int | None = None) -> None:
-        """Remove the scans taken before that many metres of travel, or so many of them."""
-        for _ in range(len(self._scans) if most is None else most):
-            if not self._scans or self._scans[0].travelled >= travelled:
-                return
-            add_scan(self.grid, self._scans.popleft(), remove=True)
 
     def remove_since(self, stamp_ns: int) -> None:
         """Remove the scans taken since."""

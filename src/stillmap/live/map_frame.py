@@ -2,6 +2,8 @@
 
 import logging
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -179,12 +181,10 @@ class MapFrame:
         self._count += 1
         if self._count % _TRIM_EVERY == 0:
             trim_heap()
-        if self._closer is not None:
-            kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
-            try:
-                self._closer.add(kept, registered.explained, self._drift)
-            except OSError as error:
-                self._give_up_loops(error)
+        with self._while_disk_lasts() as closer:
+            if closer is not None:
+                kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
+                closer.add(kept, registered.explained, self._drift)
         self._drift = np.zeros((3, 3))
 
     def correct(
@@ -217,17 +217,19 @@ class MapFrame:
         self._go_on(labels, odometry, to_the_end=not self._in_background)
 
     def _poll(self) -> Correction | None:
-        try:
-            return None if self._closer is None else self._closer.poll()
-        except OSError as error:
-            self._give_up_loops(error)
-            return None
+        with self._while_disk_lasts() as closer:
+            return None if closer is None else closer.poll()
+        return None
 
-    def _give_up_loops(self, error: OSError) -> None:
-        """The disk is full, and no scan can be kept for later loops."""
-        _log.error("%s: poses go on, but loops are no longer closed", error.strerror or error)
-        self.stop()
-        self._closer = None
+    @contextmanager
+    def _while_disk_lasts(self) -> Iterator[LoopClosing | None]:
+        """What closes loops, which ends where the disk is full: no scan can be kept for later."""
+        try:
+            yield self._closer
+        except OSError as error:
+            _log.error("%s: poses go on, but loops are no longer closed", error.strerror or error)
+            self.stop()
+            self._closer = None
 
     def enter(self, covariance: Float) -> None:
         """Go on elsewhere in the map, where the robot was found: corrections that were begun

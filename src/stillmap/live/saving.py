@@ -116,7 +116,7 @@ class Snapshot(ShortRepr):
         noted, details = self.recording.source, dict(self.recording.source.details)
         if warnings:
             details["lost_scans"] = int(np.count_nonzero(self.submap))
-        if kept_map is not None and kept_map.cloud is not None:
+        if kept_map is not None and kept_map.stands is not None:
             details[EXTENDS] = True
         source = replace(noted, warnings=[*noted.warnings, *warnings], details=details)
         taken = self._take(main, source)

@@ -33,7 +33,6 @@ _MIN_TRAVEL = 8.0  # m after which directions are known
 # normals of one wall share their errors: evidence of each; std of a building's walls about its
 # directions, rad, which one metre of travel shows once
 _EVIDENCE, _MIN_STD = 0.1, np.radians(0.3)
-_FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 # scans that contradict the map more than others agree, after which the robot was carried; at most
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
@@ -200,8 +199,7 @@ class ScanOdometry:
             return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
         added = self.local_map.add(replace(scan, e=recent))
-        most = None if self._seconds >= _FAST else 0 if added else 1
-        self.local_map.tend(beams.stamp_ns, self.travelled, label, most)
+        self.local_map.tend(beams.stamp_ns, self.travelled, label)
         return scan if added else None
 
     def enter(self, local_map: Any, T: Float) -> None:

@@ -127,23 +127,21 @@ class SweepOdometry:
         kept, state = take_beams(beams, self._kept), self._state
         T, weights = kept.T_base_sensor, e[self._kept]
         in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-        if self._known is None:
-            self._add(in_base, weights)
-        else:
+        if self._known is not None:
             self._known.add(in_base, weights, state.T_map_base)
+        else:
+            self.local_map.add(in_base, weights, state.T_map_base)
+            self._forget_what_is_far()
         if self._since < 1.0 or not weights.any():
             return None
         self._since = 0.0
         return MappedScan(kept, weights, state.T_map_base, self.travelled)
 
-    def _add(self, points: Float32, weights: Float32) -> None:
-        """Add points (N, 3) in the base frame to the local map, and forget what is far away."""
-        state = self._state
-        self.local_map.add(points, weights, state.T_map_base)
-        here = state.T_map_base[:3, 3]
-        if np.linalg.norm(here - self._cropped_at) > lidar_odometry.CROP_STEP:
-            self._cropped_at = here.copy()
-            self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
+    def _forget_what_is_far(self) -> None:
+        T = self._state.T_map_base
+        if np.linalg.norm(T[:3, 3] - self._cropped_at) > lidar_odometry.CROP_STEP:
+            self._cropped_at = T[:3, 3].copy()
+            self.local_map.crop(T, lidar_odometry.MAX_RANGE)
 
     def enter(self, known: Any, T: Float) -> None:
         """Go on in a known map, in whose frame the frame so far has the pose T (4, 4)."""

@@ -79,6 +79,12 @@ def is_level(cells: Int64) -> Bool:
     return np.isin(key + 1, key, invert=True)
 
 
+def count_up(counts: Int64) -> tuple[Int64, Int64]:
+    """Of counts (n,): which one each is of, and its number, from 0 on: (m,) both."""
+    of = np.repeat(np.arange(len(counts)), counts)
+    return of, np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
 class SweepView:
     """The planar view.
 
@@ -142,7 +148,6 @@ def _trace_low(start: Float, ends: Float, ground: GroundMap, step: float) -> Flo
     ends, length, bottom = ends[low], length[low], bottom[low]
     first = np.clip((top - _CLEARANCE) / np.maximum(top - bottom, 1e-6), 0.0, 1.0) * length
     counts = np.maximum(np.floor((length - _MARGIN - first) / step), 0.0).astype(np.int64)
-    of = np.repeat(np.arange(len(ends)), counts)
-    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    of, number = count_up(counts)
     share = (first[of] + (number + 0.5) * step) / length[of]
     return np.asarray(start[:2] + share[:, None] * (ends[of, :2] - start[:2]))

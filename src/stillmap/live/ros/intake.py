@@ -85,6 +85,7 @@ class ScanIntake:
     Attributes:
         counts: scans that were left out, by the reason.
         set_back: s by which the clock of all scans was set back for good; 0: it was not.
+        waiting: scans that are to be tried again after a while, the first one first.
     """
 
     def __init__(self, parameters: Parameters, transforms: "Transforms") -> None:
@@ -96,7 +97,7 @@ class ScanIntake:
 
     def _begin(self) -> None:
         self._lasers: dict[str, _Laser] = {}
-        self._waiting: list[_Waiting] = []
+        self.waiting: list[_Waiting] = []
         self._last_ns, self._last_topics = 0, set[str]()  # of the last scan that was mapped
         self._first_arrived: float | None = None
         self._silent_ns = -1  # the last odometry when a scan waited for it in vain
@@ -107,11 +108,6 @@ class ScanIntake:
         """Forget scans, odometry and transforms that are not static: time has begun anew."""
         self._begin()
         self._transforms.forget()
-
-    @property
-    def has_waiting(self) -> bool:
-        """True while scans wait: try again after a while."""
-        return bool(self._waiting)
 
     def add_scan(self, topic: str, message: Any, now: float) -> None:
         """Add a LaserScan or PointCloud2 that arrived now, in seconds of a steady clock."""
@@ -129,21 +125,21 @@ class ScanIntake:
             return
         if self._first_arrived is None:
             self._first_arrived = now
-        heapq.heappush(self._waiting, _Waiting(stamp, next(self._numbers), topic, message, now))
-        if len(self._waiting) > self._parameters.scan_queue_size:
-            heapq.heappop(self._waiting)
+        heapq.heappush(self.waiting, _Waiting(stamp, next(self._numbers), topic, message, now))
+        if len(self.waiting) > self._parameters.scan_queue_size:
+            heapq.heappop(self.waiting)
             self.counts[OVERFLOW] += 1
 
     def take(self, now: float) -> Arrival | None:
         """The next scan that can be mapped, or that has waited long enough; None: there is none."""
-        while self._waiting:
-            first = self._waiting[0]
+        while self.waiting:
+            first = self.waiting[0]
             has_waited = now - first.arrived >= self._parameters.transform_timeout
             mount = self._find_mount(first)
             pose = self._transforms.odometry_at(first.stamp_ns)
             fault = NO_MOUNT if mount is None and has_waited else self._find_fault(first, pose)
             if fault is not None:
-                heapq.heappop(self._waiting)
+                heapq.heappop(self.waiting)
                 self.counts[fault] += 1
                 continue
             if mount is None or self._must_wait(first, pose, now, has_waited):
@@ -216,7 +212,7 @@ class ScanIntake:
         return self._silent_ns != self._transforms.last_odometry_ns and not has_waited
 
     def _release(self, mount: Mount, pose: Float | None) -> Arrival:
-        scan = heapq.heappop(self._waiting)
+        scan = heapq.heappop(self.waiting)
         if scan.stamp_ns > self._last_ns:
             self._last_ns, self._last_topics = scan.stamp_ns, set()
         self._last_topics.add(scan.topic)

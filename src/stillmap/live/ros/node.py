@@ -175,7 +175,7 @@ class LiveNode:
     def _answer_all(self) -> None:
         while (arrival := self._intake.take(time.monotonic())) is not None:
             self._answer(arrival)
-        if not self._intake.has_waiting:
+        if not self._intake.waiting:
             self._poll.cancel()  # a timer that only ticks takes a tenth of a core
         elif self._poll.is_canceled():
             self._poll.reset()
@@ -195,7 +195,6 @@ class LiveNode:
             f"the one so far goes to {folder}"
         )
         self._intake.begin_anew()
-        self._publishers.begin_anew()
         if self._former is not None:
             self._former.join()
         with self._lock:

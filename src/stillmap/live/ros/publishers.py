@@ -71,11 +71,7 @@ class Publishers:
             for topic in parameters.topics
         }
         self._shown = set[int]()  # numbers of the movers with markers
-        self._tf_due_ns = 0
-
-    def begin_anew(self) -> None:
-        """Forget when something was published last: the clock was set back."""
-        self._tf_due_ns = 0
+        self._tf_ns = 0  # of the last transform
 
     def publish_answer(self, arrival: Arrival, update: Update) -> None:
         """Pose, transform, movers and labelled scan; the pose first, and nothing in the map where
@@ -100,9 +96,10 @@ class Publishers:
         names = self._parameters
         T = update.T_map_odom if names.odom_frame else update.pose
         # T is None: this scan had no odometry, and the last transform stays
-        if not names.transform_publish_period or stamp < self._tf_due_ns or T is None:
+        since_ns, period_ns = stamp - self._tf_ns, round(1e9 * names.transform_publish_period)
+        if not period_ns or 0 <= since_ns < period_ns or T is None:
             return
-        self._tf_due_ns = stamp + round(1e9 * names.transform_publish_period)
+        self._tf_ns = stamp
         until = stamp + round(1e9 * names.transform_timeout)
         self._tf.sendTransform(
             geometry.TransformStamped(
