@@ -1,6 +1,5 @@
 """Global localization: the pose of the robot in a map, without a prior."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
@@ -14,7 +13,7 @@ from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.local_frame import LocalFrame
-from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
+from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
 from stillmap.live.known_map import KeptMap, KnownLocalMap, KnownMap, to_surface_map
 from stillmap.live.local_map import LocalMap
 from stillmap.places.alignment import search_alignments
@@ -166,73 +165,22 @@ def _is_apart(first: Float, second: Float) -> bool:
     return bool(np.hypot(x, y) > _APART[0] or abs(theta) > _APART[1])
 
 
-class Localizer(ABC):
-    """A map in 2D or 3D in which a robot that is lost is searched.
+class PlanarLocalizer:
+    """A planar map of an earlier run in which a robot that is lost is searched.
+
+    Args:
+        known: the map.
+        extends: whether scans are added to it.
 
     Attributes:
         frame: of the search, in the map frame.
         is_lost: the robot is not found in it yet.
         is_ambiguous: several places fit about as well.
+        route: (T, D) from where the map was made, in 3D, once the robot is found in it.
     """
 
     frame, is_lost, is_ambiguous = LocalFrame(), True, False
-
-    @property
-    def route(self) -> Float:
-        """(T, D) from where the map was made, in 3D, once the robot is found in it."""
-        return np.zeros((0, 2))
-
-    def lose(self, labels: CausalLabels) -> None:
-        """The robot was carried: the labels begin anew."""
-        self._forget(labels)
-        self.is_lost = True
-
-    @abstractmethod
-    def localize(self, labels: CausalLabels, scan: Any, pose: Float) -> Float | None:
-        """(D+1, D+1) of the frame of the labels in the map, if the evidence is clear.
-
-        Args:
-            labels: of what was seen since the robot was lost.
-            scan: the last one; in 2D its hits.
-            pose: (D+1, D+1) of the robot in the frame of the labels.
-        """
-
-    def enter(self, labels: CausalLabels, T: Float) -> None:
-        """The robot is found: labels go on from the map, with what was seen since it was lost."""
-        self.is_lost, seen = False, labels.filter
-        known = self._known_filter(seen.sibling())
-        take_over(known, seen, np.tile(T, (labels.tags, 1, 1)), 0, seen.block_count)
-        labels.filter = known
-
-    @abstractmethod
-    def keep(self, labels: CausalLabels) -> KeptMap:
-        """The part of the known map that an extended one keeps, as of now; `labels`: so far."""
-
-    @abstractmethod
-    def _forget(self, labels: CausalLabels) -> None:
-        """Begin anew, with labels of the map, or of elsewhere where the robot was lost already."""
-
-    @abstractmethod
-    def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
-        """Filters of cells with what the map knows; `empty`: such of the same kind."""
-
-    @abstractmethod
-    def make_local_map(self, local_map: Any, T: Float) -> Any:
-        """The map that scans are matched against from now on.
-
-        Args:
-            local_map: that of what was seen since the robot was lost.
-            T: (D+1, D+1) by which that moves in its frame.
-        """
-
-
-class PlanarLocalizer(Localizer):
-    """A planar map of an earlier run.
-
-    Args:
-        known: the map.
-        extends: whether scans are added to it.
-    """
+    route = np.zeros((0, 2))
 
     def __init__(self, known: KnownMap, extends: bool) -> None:
         self.frame, self._known, self._extends = known.frame, known, extends
@@ -240,28 +188,42 @@ class PlanarLocalizer(Localizer):
         self._global = GlobalLocalizer(known, sure_agree=MIN_AGREE_ANYWHERE)
 
     def localize(self, labels: CausalLabels, scan: Scan, pose: Float) -> Float | None:
-        """Search what was seen since the robot was lost."""
+        """(D+1, D+1) of the frame of the labels in the map, if the evidence is clear.
+
+        Args:
+            labels: of what was seen since the robot was lost.
+            scan: the last one; in 2D its hits.
+            pose: (D+1, D+1) of the robot in the frame of the labels.
+        """
         if self._global is None:
             return None
         T = self._global.localize(labels.to_map(is_seen_alone=True), scan, pose)
         self.is_ambiguous = self._global.is_ambiguous
         return T
 
-    def _forget(self, labels: CausalLabels) -> None:
+    def forget(self, labels: CausalLabels) -> None:
+        """The robot was carried: begin anew, with labels of the map, or of elsewhere where it was
+        lost already."""
         if self._global is not None:
             self._global.forget()
         labels.clear()
 
-    def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+    def known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+        """Filters of cells with what the map knows; `empty`: such of the same kind."""
         self._known.prime(empty)
         return empty
 
-    def make_local_map(self, _local_map: LocalMap, _T: Float) -> LocalMap:
-        """The known map."""
+    def make_local_map(self, _local_map: Any, _T: Float) -> LocalMap:
+        """The map that scans are matched against from now on.
+
+        Args:
+            _local_map: that of what was seen since the robot was lost.
+            _T: (D+1, D+1) by which that moves in its frame.
+        """
         return KnownLocalMap(self._known, self._extends)
 
     def keep(self, _labels: CausalLabels) -> KeptMap:
-        """The map as it was."""
+        """The part of the map that an extended one keeps, as of now: all of it."""
         return KeptMap(self._known.in_map_frame, self._known.hits)
 
 
@@ -280,15 +242,17 @@ class OwnMap(PlanarLocalizer):
         with suppress(InputError):  # an empty map
             # it may be where it has never been; the map is that of a moment ago
             self._global = GlobalLocalizer(KnownMap(labels.to_map()), MIN_AGREE_ANYWHERE)
-        self._forget(labels)
+        self.forget(labels)
 
-    def _forget(self, labels: CausalLabels) -> None:
+    def forget(self, labels: CausalLabels) -> None:
+        """It was carried again: begin anew."""
         labels.filter = self._filter.sibling()
 
-    def _known_filter(self, _empty: OccupancyFilter) -> OccupancyFilter:
+    def known_filter(self, _empty: OccupancyFilter) -> OccupancyFilter:
+        """Those of the map."""
         return self._filter
 
-    def make_local_map(self, local_map: LocalMap, T: Float) -> LocalMap:
+    def make_local_map(self, local_map: Any, T: Float) -> LocalMap:
         """The local map of before with that of what was seen since."""
         self._local_map.join(local_map, T)
         return self._local_map

@@ -21,10 +21,11 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.from_arrays import poses_to_matrices
-from stillmap.live.global_localization import Localizer, PlanarLocalizer
+from stillmap.live.global_localization import PlanarLocalizer
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.live.online_slam import OnlineSlam
+from stillmap.live.robot_finder import Localizer
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.sweep_localization import SweepLocalizer

@@ -14,14 +14,13 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import Registration
-from stillmap.live.global_localization import Localizer
 from stillmap.live.history import History
 from stillmap.live.known_map import KeptMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_process import LoopProcess, make_closer
 from stillmap.live.map_frame import FrontEnd, LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.movers import MoverTracker
-from stillmap.live.robot_finder import RobotFinder
+from stillmap.live.robot_finder import Localizer, RobotFinder
 from stillmap.live.scan import BeamSelector, Observation, ScanBeams, deskew, find_margins
 from stillmap.live.scan_odometry import ScanOdometry, thin
 from stillmap.live.sweep_odometry import SweepOdometry

@@ -8,8 +8,11 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
-from stillmap.live.global_localization import Localizer, OwnMap
+from stillmap.live.global_localization import OwnMap, PlanarLocalizer
 from stillmap.live.map_frame import FrontEnd, MapFrame
+from stillmap.live.sweep_localization import SweepLocalizer
+
+Localizer = PlanarLocalizer | SweepLocalizer
 
 _COVARIANCE = np.diag(np.square([0.1, 0.1, 0.02]))  # m, m, rad: of a pose that was found
 # of the scans that agreed with the map before others contradicted it, the last ones: somewhere else
@@ -84,7 +87,8 @@ class RobotFinder:
             frame.finish_correction(labels, odometry)
         search = self._carried or self._place
         if search is not None:
-            search.lose(labels)
+            search.forget(labels)
+            search.is_lost = True
         elif self._dimension == 2:
             self._carried = OwnMap(labels, odometry.left_behind)
         else:
@@ -127,7 +131,10 @@ class RobotFinder:
             return None
         motion = np.asarray(se2.inverse(frame.T_map_local) @ T @ frame.T_map_local)
         odometry.enter(search.make_local_map(odometry.local_map, motion), motion)
-        search.enter(labels, T)
+        seen = labels.filter
+        known = search.known_filter(seen.sibling())
+        take_over(known, seen, np.tile(T, (labels.tags, 1, 1)), 0, seen.block_count)
+        labels.filter, search.is_lost = known, False
         frame.enter(_COVARIANCE)
         self._carried = None
         self._stretches[-1].last, self._stretches[-1].T = scans, motion

@@ -8,7 +8,7 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
-from stillmap.live.global_localization import GlobalLocalizer, Localizer
+from stillmap.live.global_localization import GlobalLocalizer
 from stillmap.live.known_cloud import KnownCloud, KnownPlanes
 from stillmap.live.known_map import LOG_RATIO, KeptMap, KnownMap, overlay
 from stillmap.live.local_map import MappedScan
@@ -25,7 +25,7 @@ _GONE_WEIGHT = 1.0  # of a surface of the map where the view is free: a car may 
 _FEW_POINTS = 600  # of the last sweep, about, which are registered at every place that is proposed
 
 
-class SweepLocalizer(Localizer):
+class SweepLocalizer:
     """A known map in 3D, and the search in it by what the robot saw since it was lost.
 
     Args:
@@ -33,7 +33,12 @@ class SweepLocalizer(Localizer):
         extends: whether sweeps are added to it.
         options: see Options.
         threads: the result does not depend on it.
+
+    Attributes:
+        frame, is_lost, is_ambiguous: see PlanarLocalizer.
     """
+
+    is_lost, is_ambiguous = True, False
 
     def __init__(self, known: KnownCloud, extends: bool, options: Options, threads: int) -> None:
         self.frame, self._extends, output = known.planar.frame, extends, options.output
@@ -62,9 +67,9 @@ class SweepLocalizer(Localizer):
     def _route(self) -> Float:
         return self._poses[:, :3, 3]
 
-    def _forget(self, labels: CausalLabels) -> None:
-        """A map that is extended is searched with what the labels added, and they go on with it
-        once the robot is found."""
+    def forget(self, labels: CausalLabels) -> None:
+        """The robot was carried. A map that is extended is searched with what the labels added, and
+        they go on with it once the robot is found."""
         self._begin_search()
         if not self._extends:
             labels.clear()
@@ -82,7 +87,8 @@ class SweepLocalizer(Localizer):
         """The map that sweeps are registered to: one and the same."""
         return self._local_map
 
-    def _known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+    def known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+        """Filters of voxels with what the map knows; `empty`: such of the same kind."""
         if self._left is not None:
             return self._left
         empty.prime(*self._voxels, LOG_RATIO)
