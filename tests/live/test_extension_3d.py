@@ -146,7 +146,8 @@ def occupied_of(first, grid):
 
 
 @pytest.mark.slow
-def test_the_result_is_whole(drive):
+def test_the_result_is_whole_and_converted_with_what_was_known(rooms, drive, tmp_path):
+    """Of which its recording shows nothing."""
     mapper, updates, folder = drive
     saved, run = stillmap.load(folder), json.loads((folder / "run.json").read_text())
     np.testing.assert_allclose(saved.poses, mapper.poses, atol=1e-6)
@@ -155,12 +156,6 @@ def test_the_result_is_whole(drive):
     assert run["input"]["extends_map"] is True
     assert saved.map.resolution == EDGE
     assert (folder / "live/trajectory.tum").is_file()
-
-
-@pytest.mark.slow
-def test_it_is_converted_with_what_was_known(rooms, drive, tmp_path):
-    """Of which its recording shows nothing."""
-    folder = drive[2]
     stillmap_folder.write(rooms[2].recording, tmp_path / "in")
     words = ["convert", str(folder), "--input", str(tmp_path / "in"), "--only", "static", "-o"]
     assert main([*words, str(tmp_path / "out.ply")]) == 0
@@ -170,11 +165,9 @@ def test_it_is_converted_with_what_was_known(rooms, drive, tmp_path):
 @pytest.mark.slow
 def test_it_can_be_extended_again(rooms, drive):
     """Which then goes on from the route of both runs, though nobody drives the first one again."""
-    _, known, _ = rooms
-    once = KnownCloud(drive[2], KnownMap(drive[2]))
-    before = KnownCloud(known, KnownMap(known)).poses[:, :3, 3]
-    off = np.linalg.norm(before[:, None] - once.poses[None, :, :3, 3], axis=2).min(axis=1)
-    assert off.max() < 1.0
+    before, once = (KnownCloud(one, KnownMap(one)) for one in (rooms[1], drive[2]))
+    off = before.poses[:, None, :3, 3] - once.poses[None, :, :3, 3]
+    assert np.linalg.norm(off, axis=2).min(axis=1).max() < 1.0
     kept = once.keep(None, 1.0, EDGE, (0.2, 1.8))
     assert len(kept.points) == len(once.points)
     assert len(kept.route) < len(once.poses)

@@ -62,18 +62,14 @@ def count_passes(stay):
     return stay.reshape(-1, LAP).mean(axis=1)
 
 
-def test_the_first_and_the_latest_passes_stay():
+def test_the_first_and_the_latest_passes_stay_however_many_there_were():
     stay = graph_sparsification.select_scans(*laps_with_loops(20))
     passes = count_passes(stay)
     assert passes[0] == 1.0
     assert (passes[1:12] == 0.0).all()
     assert passes[-2:].min() == 1.0
     assert stay.sum() <= 8 * LAP
-
-
-def test_as_many_stay_after_twice_the_travel():
-    counts = [graph_sparsification.select_scans(*laps_with_loops(laps)).sum() for laps in (15, 30)]
-    assert counts[0] == counts[1]
+    assert graph_sparsification.select_scans(*laps_with_loops(30)).sum() == stay.sum()
 
 
 def test_stretches_that_no_loop_ties_stay():

@@ -9,7 +9,7 @@ from live_runs import answers, poses_of
 
 from stillmap.core import se2
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.odometry_faults import DeadReckoning, standing_prior
+from stillmap.live.odometry_faults import DeadReckoning
 from stillmap.live.replay import iter_beams
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
@@ -64,15 +64,6 @@ def test_a_robot_that_drives_on_does_not_stand(scene):
     recording = simulation.recording
     assert recording.T_odom_base is not None
     assert not any("slip" in one.doubts for one in answers(recording))
-
-
-def test_the_standing_robot_is_free_to_move_on():
-    prior = standing_prior(se2.matrix(1.0, 2.0, 0.5), se2.matrix(0.3, 0.4, -0.2))
-    np.testing.assert_allclose(prior.T_map_base, se2.matrix(1.0, 2.0, 0.5))
-    assert prior.translation_std == pytest.approx(0.5)
-    assert prior.rotation_std == pytest.approx(0.2)
-    assert not prior.is_odometry
-    assert standing_prior(np.eye(3), np.eye(3)).translation_std > 0.0
 
 
 def test_an_error_of_the_heading_grows_with_the_way():

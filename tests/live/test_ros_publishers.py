@@ -27,6 +27,12 @@ def publishers(node, **parameters):
     return module.Publishers(node, Parameters(**parameters))
 
 
+@pytest.fixture
+def node():
+    return Node()
+
+
+@pytest.fixture
 def map_publisher(node):
     return module.MapPublisher(node, Parameters(), "trinary")
 
@@ -41,8 +47,7 @@ def make_mover(number, position=(1.0, 2.0), velocity=(0.0, 1.0)):
 
 
 class TestMovers:
-    def test_each_has_a_body_an_arrow_and_its_number(self):
-        node = Node()
+    def test_each_has_a_body_an_arrow_and_its_number(self, node):
         publishers(node)._publish_movers([make_mover(7)], 3_000_000_005)
         (message,) = node.sent["movers"]
         body, arrow, text = message.markers
@@ -58,16 +63,14 @@ class TestMovers:
         assert text.pose.position.z > body.pose.position.z
         assert all(m.lifetime.sec > 0 and m.pose.orientation.w == 1.0 for m in message.markers)
 
-    def test_markers_of_those_that_are_gone_are_removed_once(self):
-        node = Node()
+    def test_markers_of_those_that_are_gone_are_removed_once(self, node):
         publisher = publishers(node)
         for movers in ([make_mover(1), make_mover(2)], [make_mover(2)], [], []):
             publisher._publish_movers(movers, 1)
         deleted = [[m.id for m in one.markers if m.action == 2] for one in node.sent["movers"]]
         assert deleted == [[], [1, 1, 1], [2, 2, 2]]
 
-    def test_poses_are_headed_where_they_move_and_tell_that_there_is_nobody(self):
-        node = Node()
+    def test_poses_are_headed_where_they_move_and_tell_that_there_is_nobody(self, node):
         publisher = publishers(node)
         publisher._publish_movers([make_mover(1)], 1)
         publisher._publish_movers([], 2)
@@ -77,8 +80,7 @@ class TestMovers:
         assert heading(first.poses[0].orientation) == pytest.approx(math.pi / 2)
         assert second.poses == []
 
-    def test_in_space_they_have_their_own_height(self):
-        node = Node()
+    def test_in_space_they_have_their_own_height(self, node):
         mover = make_mover(1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.5))
         publishers(node)._publish_movers([mover], 1)
         body, arrow, _ = node.sent["movers"][0].markers
@@ -93,12 +95,10 @@ class TestMap:
     def change(self, x, y, value, n=2):
         return MapChange(np.array([x, y]), np.full((n, n), value, np.float32))
 
-    def test_what_changed_is_one_rectangle_of_the_last_whole_map(self):
-        node = Node()
-        publisher = map_publisher(node)
-        publisher.publish(self.grid(), 1)
+    def test_what_changed_is_one_rectangle_of_the_last_whole_map(self, map_publisher, node):
+        map_publisher.publish(self.grid(), 1)
         changes = [self.change(-5, 10, 1.0), self.change(-2, 12, NAN)]
-        assert publisher.publish_changes(changes, 2_000_000_000)
+        assert map_publisher.publish_changes(changes, 2_000_000_000)
         (update,) = node.sent["map_updates"]
         assert (update.x, update.y, update.width, update.height) == (0, 0, 5, 4)
         cells = np.array(update.data).reshape(4, 5)
@@ -107,31 +107,28 @@ class TestMap:
         np.testing.assert_array_equal(cells, expected)
         assert update.header.stamp.sec == 2
         # what was sent before stays
-        assert publisher.publish_changes([self.change(-4, 11, 0.0)], 2_900_000_000)
+        assert map_publisher.publish_changes([self.change(-4, 11, 0.0)], 2_900_000_000)
         assert len(node.sent["map_updates"]) == 1  # once a second
-        assert publisher.publish_changes([], 3_000_000_000)
+        assert map_publisher.publish_changes([], 3_000_000_000)
         update = node.sent["map_updates"][1]
         assert (update.x, update.y) == (1, 1)
         np.testing.assert_array_equal(np.array(update.data), [0, 0, 0, 0])
         clock_set_back = 5
-        assert publisher.publish_changes([self.change(-5, 10, 0.5, n=3)], clock_set_back)
+        assert map_publisher.publish_changes([self.change(-5, 10, 0.5, n=3)], clock_set_back)
         np.testing.assert_array_equal(np.array(node.sent["map_updates"][2].data), [-1] * 9)
 
     @pytest.mark.parametrize("at", [(-6, 10), (0, 12), (-5, 9), (-5, 13)])
-    def test_a_whole_map_is_due_where_it_has_grown(self, at):
-        node = Node()
-        publisher = map_publisher(node)
-        assert not publisher.publish_changes([self.change(0, 0, 1.0)], 1)  # there is none yet
-        publisher.publish(self.grid(), 1)
-        assert not publisher.publish_changes([self.change(*at, 1.0)], 2_000_000_000)
+    def test_a_whole_map_is_due_where_it_has_grown(self, at, map_publisher, node):
+        assert not map_publisher.publish_changes([self.change(0, 0, 1.0)], 1)  # there is none yet
+        map_publisher.publish(self.grid(), 1)
+        assert not map_publisher.publish_changes([self.change(*at, 1.0)], 2_000_000_000)
         assert not node.sent["map_updates"]
         node.listeners = 0  # to updates: the whole map comes when it is due
-        assert publisher.publish_changes([self.change(*at, 1.0)], 4_000_000_000)
+        assert map_publisher.publish_changes([self.change(*at, 1.0)], 4_000_000_000)
 
-    def test_the_whole_map(self):
-        node = Node()
+    def test_the_whole_map(self, map_publisher, node):
         grid = GridMap(np.array([[0.0, 1.0, NAN]], np.float32), (-2.0, 3.0, 0.0), 0.05)
-        map_publisher(node).publish(grid, 7_000_000_009)
+        map_publisher.publish(grid, 7_000_000_009)
         (out,) = node.sent["map"]
         assert (out.info.width, out.info.height, out.info.resolution) == (3, 1, 0.05)
         assert (out.info.origin.position.x, out.info.origin.position.y) == (-2.0, 3.0)
@@ -140,10 +137,9 @@ class TestMap:
         assert list(out.data) == [0, 100, -1]
         assert (out.header.frame_id, out.header.stamp.sec) == ("map", 7)
 
-    def test_without_map_msgs(self, monkeypatch):
+    def test_without_map_msgs(self, monkeypatch, node):
         monkeypatch.setattr(module, "OccupancyGridUpdate", None)
-        node = Node()
-        publisher = map_publisher(node)
+        publisher = module.MapPublisher(node, Parameters(), "trinary")
         publisher.publish(self.grid(), 1)
         assert publisher.publish_changes([self.change(50, 50, 1.0)], 2)
         assert list(node.sent) == ["map"]
@@ -162,9 +158,8 @@ def read_cloud(message):
 
 
 class TestScans:
-    def test_points_of_a_laser_are_in_its_own_frame(self):
+    def test_points_of_a_laser_are_in_its_own_frame(self, node):
         """Upside down too: the frame is, not the message."""
-        node = Node()
         message = laser_scan(5_000_000_001, [1.0, math.inf, 2.0, 3.0], angle_min=0.0)
         beams = to_scan_beams(message, "scan", Mount(np.eye(3), is_upside_down=True))
         arrival = SimpleNamespace(topic="scan", message=message, beams=beams)
@@ -177,8 +172,7 @@ class TestScans:
         assert list(node.sent["scan_static"][0].ranges)[2] == math.inf
         assert list(node.sent["scan_dynamic"][0].ranges)[2] == 2.0
 
-    def test_clouds_are_split_as_clouds(self):
-        node = Node()
+    def test_clouds_are_split_as_clouds(self, node):
         points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [NAN, 0.0, 0.0], [0.0, 90.0, 0.0]]
         message = point_cloud(5, points)
         beams = to_cloud_beams(message, "points", Mount(np.eye(4)), max_range=50.0)
@@ -203,8 +197,8 @@ class TestPoses:
         arrival = SimpleNamespace(topic="scan", message=message, beams=beams)
         publishers(node).publish_answer(arrival, update)
 
-    def test_in_the_plane(self):
-        node, T = Node(), se2.matrix(1.0, -2.0, -3.0)
+    def test_in_the_plane(self, node):
+        T = se2.matrix(1.0, -2.0, -3.0)
         self.publish(node, T, np.arange(9.0).reshape(3, 3), se2.matrix(3.0, 4.0, 0.5))
         (pose,), (transform,) = node.sent["pose"], node.sent["/tf"]
         assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == (1.0, -2.0)
@@ -219,8 +213,8 @@ class TestPoses:
         assert (transform.transform.translation.x, transform.transform.translation.y) == (3.0, 4.0)
         assert heading(transform.transform.rotation) == pytest.approx(0.5)
 
-    def test_in_space(self):
-        node, T = Node(), np.eye(4)
+    def test_in_space(self, node):
+        T = np.eye(4)
         T[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
         T[:3, 3] = 1.0, 2.0, 3.0
         self.publish(node, T, np.arange(36.0).reshape(6, 6), None)
@@ -231,7 +225,6 @@ class TestPoses:
         np.testing.assert_array_equal(pose.pose.covariance, np.arange(36.0))
         assert node.sent["/tf"] == []  # this scan had no odometry
 
-    def test_nothing_in_the_map_while_the_robot_is_lost(self):
-        node = Node()
+    def test_nothing_in_the_map_while_the_robot_is_lost(self, node):
         self.publish(node, np.eye(3), np.eye(3), np.eye(3), ("lost",))
         assert node.sent["pose"] == node.sent["/tf"] == []

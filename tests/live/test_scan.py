@@ -13,9 +13,7 @@ def test_readings_mean_what_they_mean_in_ros():
     assert beams.hit.tolist() == [True, False, False, False, False, False, False]
     np.testing.assert_allclose(beams.points[[0, 4, 5], 0], [1.0, 8.0, 8.0])
     assert np.isnan(beams.points[[1, 2, 3, 6]]).all()
-
-
-def test_without_a_stated_range_nothing_is_known_of_beams_without_a_return():
+    # without a stated range nothing is known of beams without a return
     beams = to_beams(Scan(0, [2.0, np.inf], [0.0, 0.5]))
     assert beams.hit.tolist() == [True, False]
     assert np.isnan(beams.points[1]).all()
@@ -70,8 +68,3 @@ def test_what_covers_the_laser_is_dropped(near, is_covered):
     assert left.hit.any() != is_covered
     assert np.isnan(left.points).all() == is_covered
     assert beams.hit.all()
-
-
-def test_a_scan_without_readings_is_not_covered():
-    beams = to_beams(Scan(0.0, np.full(9, np.nan), np.zeros(9)))
-    assert drop_cover(beams) is beams

@@ -18,15 +18,11 @@ def from_first(poses):
     return se2.inverse(poses[0]) @ poses
 
 
-def test_poses_as_they_were_given_are_those_of_the_truth(sweeps):
+def test_poses_and_labels_are_those_of_the_truth(sweeps):
     found, true = from_first(sweeps.poses), from_first(sweeps.truth.T_world_base)
-    off = np.linalg.norm((found - true)[:, :3, 3], axis=1)
     assert np.linalg.norm(true[-1, :3, 3]) > 4.0
-    assert off.max() < 0.05
+    assert np.linalg.norm((found - true)[:, :3, 3], axis=1).max() < 0.05
     assert sweeps.updates[-1].covariance.shape == (6, 6)
-
-
-def test_what_moves_is_told_at_once(sweeps):
     hit = sweeps.recording.hit.copy()
     hit[: sweeps.recording.offset[50]] = False  # little is known yet
     says, moves = (sweeps.p_static < 0.5)[hit], ~sweeps.truth.static[hit]
@@ -37,11 +33,10 @@ def test_what_moves_is_told_at_once(sweeps):
 
 
 def test_the_map_has_obstacles_above_the_ground(sweeps):
-    found = sweeps.mapper.map
+    found, cells = sweeps.mapper.map, sweeps.mapper.cells
     occupied = found.p_occupied > 0.65
     assert occupied.sum() > 100
     assert (found.p_occupied < 0.2).sum() > 5 * occupied.sum()  # the ground
-    cells = sweeps.mapper.cells
     assert cells.cells.shape[1] == 3
     assert np.mean(cells.p_occupied > 0.5) > 0.5
 
@@ -70,31 +65,22 @@ def cover(beams):
 
 
 def test_a_lidar_that_is_covered_says_nothing_of_the_map(sweeps):
-    with LiveMapper({"threads": 1}) as mapper:
-        for t, one in enumerate(sweeps.beams[:30]):
-            if t == 20:
-                usual = mapper._slam.odometry._usual
-            is_covered = 20 <= t < 25
-            doubts = mapper.push(cover(one) if is_covered else one).doubts
-            assert ("blind" in doubts) == is_covered
-            if is_covered:
-                assert mapper._slam.odometry._usual == usual
-        assert not doubts
-
-
-def test_a_lidar_that_is_covered_at_first(sweeps):
+    """At first and later."""
     true = from_first(sweeps.truth.T_world_base[2:30])
     with LiveMapper({"threads": 1}) as mapper:
-        for one in sweeps.beams[:2]:
-            mapper.push(cover(one))
-        assert len(mapper.poses) == 2
-        assert not mapper.map.p_occupied.size
-        found = [mapper.push(one).pose for one in sweeps.beams[2:30]]
-        assert mapper._slam.labels._pixels[0] == find_pixel_size(
-            sweeps.beams[2].points, sweeps.beams[2].hit
-        )
-        np.testing.assert_allclose(mapper.poses[2:], found, atol=1e-9)
-    off = np.linalg.norm((from_first(np.array(found)) - true)[:, :3, 3], axis=1)
+        for t, one in enumerate(sweeps.beams[:30]):
+            is_covered = t < 2 or 20 <= t < 25
+            update = mapper.push(cover(one) if is_covered else one)
+            assert ("blind" in update.doubts) == is_covered
+            if t == 1:
+                assert not mapper.map.p_occupied.size
+        pixel = find_pixel_size(sweeps.beams[2].points, sweeps.beams[2].hit)
+        assert mapper._slam.labels._pixels[0] == pixel
+        poses = mapper.poses
+    assert len(poses) == 30
+    assert not update.doubts
+    np.testing.assert_allclose(poses[-1], update.pose, atol=1e-9)
+    off = np.linalg.norm((from_first(poses[2:]) - true)[:, :3, 3], axis=1)
     assert off.max() < 0.2
 
 
