@@ -76,15 +76,15 @@ def test_damage_of_an_open_drive_is_named(corridor, tmp_path):
     with LiveMapper({"threads": 1}, folder=tmp_path / "drive") as mapper:
         drive(mapper, corridor, range(2))
         shutil.copytree(tmp_path / "drive", tmp_path / "killed")
-    os.truncate(tmp_path / "killed/points.npy", 200)
-    with pytest.raises(InputError, match="no whole scan"):
-        read(tmp_path / "killed")
-    (tmp_path / "killed/points.npy").write_bytes(b"x" * 500)
-    with pytest.raises(InputError, match=r"points\.npy: is damaged"):
-        read(tmp_path / "killed")
-    (tmp_path / "killed/stamp_ns.npy").unlink()
-    with pytest.raises(InputError, match=r"stamp_ns\.npy"):
-        read(tmp_path / "killed")
+    points, stamps = (tmp_path / f"killed/{name}.npy" for name in ("points", "stamp_ns"))
+    for harm, said in (
+        (lambda: os.truncate(points, 200), "no whole scan"),
+        (lambda: points.write_bytes(b"x" * 500), r"points\.npy: is damaged"),
+        (stamps.unlink, r"stamp_ns\.npy"),
+    ):
+        harm()
+        with pytest.raises(InputError, match=said):
+            read(tmp_path / "killed")
 
 
 def test_odometry_and_beam_times_of_some_scans(corridor, tmp_path):

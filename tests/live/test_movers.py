@@ -121,19 +121,6 @@ def test_tracks_are_in_the_frame_of_the_base_and_answered_in_that_of_the_map():
     assert not plain.movers(np.eye(3))
 
 
-def test_two_lasers_see_the_same_mover():
-    path, tracker = walk((3.0, -1.0), (0.0, 1.0)), MoverTracker(2)
-    T = se2.matrix(-0.4, 0.0, np.pi)
-    for k in range(20):
-        center = path(0.5 * k * PERIOD)
-        one = scan(0.5 * k * PERIOD, disk(center))
-        back = (np.c_[disk(center), np.ones(20)] @ se2.inverse(T).T)[:, :2]
-        other = scan(0.5 * k * PERIOD, back, sensor=1, T_base_sensor=T)
-        push(tracker, one)
-        push(tracker, other)
-    assert len(tracker.movers(np.eye(3))) == 1
-
-
 def test_movers_in_a_corridor_are_its_walkers(corridor):
     """Of those that have been in sight for a second within 10 m, and of what is taken for one."""
     truth, recording = corridor.truth, corridor.recording

@@ -45,22 +45,6 @@ def test_times_of_beams(increment, times):
         np.testing.assert_allclose(found, times)
 
 
-@pytest.mark.parametrize(
-    "fields", [{"angle_increment": 0.0}, {"angle_increment": 3.0}, {"angle_min": NAN}]
-)
-def test_scans_that_are_none(fields):
-    assert messages.shape_of(laser_scan(1, [1.0] * 10, **fields)).find_fault() is not None
-
-
-def test_what_stands_and_what_moves():
-    ranges = np.array([1.0, 2.0, INF, NAN, 3.0], np.float32)
-    hit = np.array([True, True, False, False, True])
-    p_static = np.array([0.9, 0.1, 0.1, NAN, 0.5], np.float32)
-    static, dynamic = messages.split_ranges(ranges, hit, p_static)
-    np.testing.assert_array_equal(static, np.float32([1.0, INF, INF, NAN, 3.0]))
-    np.testing.assert_array_equal(dynamic, np.float32([INF, 2.0, INF, INF, INF]))
-
-
 def test_cells_as_nav2_reads_them():
     p = np.array([[0.0, 0.19, 0.3], [0.66, 1.0, NAN]], np.float32)
     np.testing.assert_array_equal(messages.to_cells(p, "trinary"), [[0, 0, -1], [100, 100, -1]])
