@@ -186,15 +186,12 @@ def _find_standing(points: Float32, now: CellProbabilities, p_unseen: float, edg
 def _share_evidence(cells: Int64, p_occupied: Float, p_unseen: float) -> Float:
     """(N,) probabilities of voxels (N, 3) in lexicographic order after what this run saw of those
     around them, too: voxels of one thing leave together, and rings of a sweep miss many of them."""
-    logit = _logit(p_occupied)
-    evidence = np.clip(logit - _logit(np.array(p_unseen)), -LOG_RATIO, LOG_RATIO)
+    from scipy.special import expit, logit  # slow to load
+
+    before, now = (logit(np.clip(p, 1e-6, 1.0 - 1e-6)) for p in (p_unseen, p_occupied))
+    evidence = np.clip(now - before, -LOG_RATIO, LOG_RATIO)
     around = _sum_around(cells, evidence) - evidence
-    return np.asarray(1.0 / (1.0 + np.exp(-(logit + _NEIGHBOUR_WEIGHT * around))))
-
-
-def _logit(p: Float) -> Float:
-    within = np.clip(p, 1e-6, 1.0 - 1e-6)
-    return np.asarray(np.log(within / (1.0 - within)))
+    return np.asarray(expit(now + _NEIGHBOUR_WEIGHT * around))
 
 
 def _sum_around(cells: Int64, values: Float) -> Float:
