@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_types import Float, Float32, Int32
 from stillmap.core.camera import Camera, Images, unproject
 from stillmap.core.errors import InputError
+from stillmap.sim.dynamics import Moment
 from stillmap.sim.geometry import BOX, ELLIPSOID, Solids, make_pose, to_local
 from stillmap.sim.options import CameraOptions
 from stillmap.sim.ray_casting import Rays, cast_rays
@@ -95,12 +96,6 @@ def compute_sky_color(direction: Float) -> Color:
     return _to_uint8(_HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up))
 
 
-def compute_mover_color(kind: str, spot: SurfacePoints) -> Color:
-    """(n, 3) RGB of points on a "person", "door", "car", "forklift" or "thing"."""
-    paint = {"person": _person, "door": _door, "thing": _thing}.get(kind, _vehicle)
-    return _to_uint8(paint(spot))
-
-
 def _person(spot: SurfacePoints) -> Float:
     mover, form, half, z, p, seed = spot
     u, v, w = p.T
@@ -154,6 +149,9 @@ def _thing(spot: SurfacePoints) -> Float:
     light, dark = _pick_colors(_CLOTHES, spot.mover, spot.seed)
     squares = np.floor(spot.local / 0.15 + 0.01).astype(np.int64).sum(axis=1)
     return np.where((squares % 2 == 0)[:, None], light, 0.7 * light + 0.3 * dark)
+
+
+_PAINTS = {"person": _person, "door": _door, "thing": _thing}  # others are vehicles
 
 
 def _pick_colors(palette: Float, mover: int, seed: int) -> tuple[Float, Float]:
@@ -270,7 +268,7 @@ class CameraSimulator:
         self._scan, self._seconds = np.repeat(scan, o.count), np.repeat(seconds, o.count)
         which = np.tile(np.arange(o.count, dtype=np.int32), len(at))
         T_base_camera = np.stack([c.T_base_camera for c in cameras if c.T_base_camera is not None])
-        moment = world.moment(self._scan, self._seconds)
+        moment = Moment(motion, self._scan, self._seconds)
         self.T_world_camera = world.T_world_base(moment) @ T_base_camera[which]
         self.images = Images(
             np.repeat(stamp_ns, o.count), which, cameras, lambda image: self.render(image).color
@@ -292,7 +290,8 @@ class CameraSimulator:
     def render(self, image: int) -> TrueImage:
         """Render an image with its truth."""
         world, T, scan = self._world, self.T_world_camera[image], int(self._scan[image])
-        moment = world.moment(np.array([scan]), self._seconds[image : image + 1])
+        motion, seconds = world.episode.motion, self._seconds[image : image + 1]
+        moment = Moment(motion, np.array([scan]), seconds)
         moving = world.movers.at(moment, scan)
         direction = np.einsum("ij,jhw->hwi", T[:3, :3], self._rays)
         seen = cast_rays(_to_rays(direction, T[:3, 3]), world.static, moving)
@@ -324,7 +323,7 @@ class CameraSimulator:
             p = to_local(at + range[pixels][:, None] * direction[pixels], moving.pose[0, k])
             form, half, z = int(moving.form[k]), moving.half[k], moving.z[k]
             spot = SurfacePoints(mover, form, half, z, p, self.colour_seed)
-            color[pixels] = compute_mover_color(kinds[mover], spot)
+            color[pixels] = _to_uint8(_PAINTS.get(kinds[mover], _vehicle)(spot))
         return color
 
     def _expose(self, color: Color, image: int) -> Color:

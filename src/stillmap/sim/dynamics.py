@@ -1,7 +1,7 @@
 """Motion of robot, people, doors, vehicles and movable objects, sampled at the scans."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,31 +106,24 @@ class Doors:
         """
         delta = self._middle[:, None] - standing
         near = np.any(np.hypot(delta[..., 0], delta[..., 1]) < _MIN_CLEARANCE, axis=1)
-        passing = self._crossed_by(ways)
+        start, end = ways[:, None, :2], ways[:, None, 2:]
+        aside = _side_of(self._hinge, self._end, start) * _side_of(self._hinge, self._end, end)
+        through = _side_of(start, end, self._hinge) * _side_of(start, end, self._end)
+        passing = np.any((aside < 0) & (through < 0), axis=0)
         self._left -= dt
-        for door in np.flatnonzero(passing & ~self._opens).tolist():
-            self._turn(door, opens=True)
-        for door in np.flatnonzero((self._left <= 0) & ~passing & ~near).tolist():
-            self._turn(door, opens=not self._opens[door])
+        over = (self._left <= 0) & ~passing & ~near
+        for which in (passing & ~self._opens, over):
+            for door in np.flatnonzero(which).tolist():
+                self._opens[door] = not self._opens[door]
+                self._left[door] = self._draw_duration(self._opens[door])
         step = dt / self._options.swing
         change = np.where(self._opens, step, np.where(near, 0.0, -step))
         self.share = np.clip(self.share + change, 0.0, 1.0)
 
-    def _turn(self, door: int, opens: bool) -> None:
-        self._opens[door] = opens
-        self._left[door] = self._draw_duration(opens)
-
     def _draw_duration(self, opens: bool) -> float:
         o = self._options
-        low, high = (o.min_open, o.max_open) if opens else (o.min_closed, o.max_closed)
-        return float(np.exp(self._rng.uniform(np.log(low), np.log(high))))
-
-    def _crossed_by(self, ways: Float) -> Bool:
-        """(D,) whether a path segment (K, 4) crosses the doorway."""
-        start, end = ways[:, None, :2], ways[:, None, 2:]
-        aside = _side_of(self._hinge, self._end, start) * _side_of(self._hinge, self._end, end)
-        through = _side_of(start, end, self._hinge) * _side_of(start, end, self._end)
-        return np.asarray(np.any((aside < 0) & (through < 0), axis=0))
+        limits = (o.min_open, o.max_open) if opens else (o.min_closed, o.max_closed)
+        return float(np.exp(self._rng.uniform(*np.log(limits))))
 
 
 def split_into_segments(corners: Float) -> Float:
@@ -149,7 +142,7 @@ def _side_of(a: Float, b: Float, c: Float) -> Float:
 
 
 Progress = Callable[[float], None]
-Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator, np.random.Generator]
+Rngs = Sequence[np.random.Generator]
 
 _MAX_STEP = 0.1  # s of a time step
 _ROBOT_MARGIN = 0.15  # m between the robot's footprint and walls along its route
@@ -219,7 +212,8 @@ def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     log: list[tuple[Float, ...]] = []
     while not _is_done(scene, world.robot, len(log), expected):
         if len(log) == carried:
-            world.carry_robot(o.carried_time, dt, rngs[3])
+            world.robot.put_down(rngs[3], world.obstacles())
+            world.rest_robot(o.carried_time, dt)
         if len(log) == paused:
             world.rest_robot(min(o.pause, _MAX_SIMULATED_PAUSE), dt)
         log.append(world.snapshot())
@@ -257,11 +251,6 @@ class _World:
         self.traffic = Traffic(scene.lanes, scene.traffic, rngs[2])
         self._radius = o.radius
 
-    def carry_robot(self, seconds: float, dt: float, rng: np.random.Generator) -> None:
-        """Carry the robot to another place, while everything else moves in steps of dt seconds."""
-        self.robot.put_down(rng, self._obstacles())
-        self.rest_robot(seconds, dt)
-
     def rest_robot(self, seconds: float, dt: float) -> None:
         """Stop the robot, while everything else moves in steps of dt seconds."""
         for _ in range(round(seconds / dt)):
@@ -270,10 +259,10 @@ class _World:
 
     def step(self, dt: float) -> None:
         """Advance everything by dt seconds."""
-        self.robot.step(dt, self._obstacles(), self._radius + BODY_RADIUS)
+        self.robot.step(dt, self.obstacles(), self._radius + BODY_RADIUS)
         self._step_others(dt)
 
-    def _obstacles(self) -> Float:
+    def obstacles(self) -> Float:
         """(N, 2) positions of people and corners of vehicles."""
         if not self.traffic.kinds:
             return self.crowd.xy

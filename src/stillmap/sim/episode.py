@@ -90,11 +90,10 @@ class Episode:
     def _describe_scene(self) -> dict[str, Any]:
         """Name, seed and all parameters of the scene as JSON; walls are written as an array."""
         parameters = dataclasses.asdict(self.scene)
-        unused = ["walls", "kerbs"] if self.scene.camera.enabled else ["walls", "kerbs", "camera"]
-        if not self.scene.mirrors:
-            unused.append("mirrors")
-        if not self.scene.in_3d:
-            unused += ["lidar", "rig", "ground", "heights", "pavements"]
+        unused = ["walls", "kerbs"]
+        unused += ["camera"] * (not self.scene.camera.enabled)
+        unused += ["mirrors"] * (not self.scene.mirrors)
+        unused += ["lidar", "rig", "ground", "heights", "pavements"] * (not self.scene.in_3d)
         for name in unused:
             del parameters[name]
         return {"name": parameters.pop("name"), "seed": self.seed, **parameters}
@@ -115,7 +114,10 @@ def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> 
     crowd_rng, sensor_rng, odometry_rng, door_rng, traffic_rng, *mishap_rngs = rng.spawn(7)
     motion = simulate_motion(scene, (crowd_rng, door_rng, traffic_rng, mishap_rngs[0]), tell)
     walls = np.array([*scene.walls, *scene.glass, *motion.still, *scene.mirrors], float)
-    driven = remove_jump(se2.matrix(*motion.robot.T), motion.carried)
+    driven, carried = se2.matrix(*motion.robot.T), motion.carried
+    if carried < len(driven):  # odometry knows nothing of the jump
+        back = driven[carried - 1] @ se2.inverse(driven[carried])
+        driven = np.concatenate([driven[:carried], back @ driven[carried:]])
     T_odom_base = simulate_odometry(driven, scene.odometry, odometry_rng)
     T_odom_base = add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
     T_odom_base = delay_odometry(T_odom_base, motion.seconds, scene.odometry.latency)
@@ -209,14 +211,6 @@ def delay_odometry(T_odom_base: Float, seconds: Float, latency: float) -> Float:
     again = np.abs(T_odom_base[before + 1] - np.eye(3)).max(axis=(1, 2)) < _SAME_POSE
     share = np.where(again & (share < 1), 0.0, share)
     return np.asarray(T_odom_base[before] @ se2.matrix(*(share[:, None] * moves).T))
-
-
-def remove_jump(T_world_base: Float, scan: int) -> Float:
-    """Poses (T, 3, 3) without the jump before `scan`, if there is such a scan."""
-    if scan >= len(T_world_base):
-        return T_world_base
-    back = T_world_base[scan - 1] @ se2.inverse(T_world_base[scan])
-    return np.concatenate([T_world_base[:scan], back @ T_world_base[scan:]])
 
 
 def _stalls(seconds: Float, o: OdometryOptions, rng: np.random.Generator) -> Bool:

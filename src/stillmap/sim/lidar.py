@@ -8,6 +8,7 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.sim import laser, ray_casting
+from stillmap.sim.dynamics import Moment
 from stillmap.sim.geometry import BOX, Part, assemble, make_pose
 from stillmap.sim.options import LaserOptions, LidarOptions, RigOptions
 from stillmap.sim.ray_casting import RayReturns, Rays
@@ -81,7 +82,8 @@ class Sensor(NamedTuple):
 
     def cast_rays(self, world: World, pattern: Pattern, scan: int) -> RayReturns:
         """Exact returns of the beams of one scan."""
-        moment = world.moment(np.full(len(pattern.azimuth), scan), pattern.seconds)
+        scans = np.full(len(pattern.azimuth), scan)
+        moment = Moment(world.episode.motion, scans, pattern.seconds)
         rays = transform_rays(pattern, world.T_world_base(moment) @ self.T_base_sensor)
         exact = ray_casting.cast_rays(rays, world.static, world.movers.at(moment, scan))
         if self.own is None:

@@ -95,12 +95,9 @@ class LaserOptions:
     @property
     def recorded_mount(self) -> tuple[float, ...]:
         """x, y, yaw as the recorder has them."""
-        pairs = (
-            (self.recorded_x, self.x),
-            (self.recorded_y, self.y),
-            (self.recorded_yaw, self.yaw),
-        )
-        return tuple(true if recorded is None else recorded for recorded, true in pairs)
+        recorded = (self.recorded_x, self.recorded_y, self.recorded_yaw)
+        true = (self.x, self.y, self.yaw)
+        return tuple(b if a is None else a for a, b in zip(recorded, true, strict=True))
 
     @property
     def count(self) -> int:

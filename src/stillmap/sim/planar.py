@@ -1,7 +1,7 @@
 """Recording of planar lasers: sweeps, mirrors, bumps that show the floor, blind stretches."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +39,8 @@ def record_planar(episode: Episode) -> tuple[Recording, Truth]:
         by = exact.wall >= len(walls) - len(scene.mirrors)
         by &= rng.random(by.shape) >= o.mirror_return_share
         exact = _reflect_beams(exact, by, episode, mounts[sensor], bearing)
-    bumps = simulate_bumps(motion.robot, motion.seconds, scene.robot, rng)
-    if len(bumps.start):
+    if scene.robot.bump_rate > 0:
+        bumps = simulate_bumps(motion.robot, motion.seconds, scene.robot, rng)
         sweep = Sweep.of(o)
         tilt = bumps.tilt(motion.seconds[:, None] + sweep.seconds)
         tilt = np.repeat(tilt, sweep.group, axis=1)[:, : o.beams]
@@ -102,8 +102,7 @@ def _describe_sensors(o: LaserOptions, angles: Float) -> list[SensorNotes]:
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(NamedTuple):
     """Times of the beams of a scan.
 
     Attributes:
@@ -213,8 +212,7 @@ def _with_robot(people: Movers, robot: Float, radius: float) -> Movers:
     return Movers(xy, heading, semi_axes, np.append(people.mover, np.int32(MIRRORED)))
 
 
-@dataclass(frozen=True, eq=False)
-class Bumps:
+class Bumps(NamedTuple):
     """K bumps of the robot, each a half sine wave of pitch and roll.
 
     Attributes:
@@ -246,10 +244,8 @@ def simulate_bumps(
         robot: (T, 3) poses.
         seconds: (T,) times of them.
         options: rate and size of bumps.
-        rng: not used at rate 0.
+        rng: of their places and sizes.
     """
-    if options.bump_rate == 0:
-        return Bumps(np.empty(0), np.empty(0), np.empty((0, 2)))
     steps = np.hypot(*np.diff(robot[:, :2], axis=0).T)
     # being carried or turned on the spot shakes nobody
     steps[np.diff(seconds) > 1.5 * np.median(np.diff(seconds))] = 0.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_types import Bool, Float, Int32, Int64
 from stillmap.core.errors import InputError
 
-_SPACING = 0.1  # m between nodes of the clearance grid
+SPACING = 0.1  # m between nodes of the clearance grid
 _STRIDE = 2  # the planner uses every second node
 _MARGIN = 0.5  # m around the walls
 _MAX_CLEARANCE = 1.5  # m
@@ -38,15 +38,10 @@ class FreeSpace:
     def __init__(self, walls: Float) -> None:
         ends = walls.reshape(-1, 2)
         self.origin = ends.min(axis=0) - _MARGIN
-        size = np.ceil((ends.max(axis=0) + _MARGIN - self.origin) / _SPACING).astype(int) + 1
+        size = np.ceil((ends.max(axis=0) + _MARGIN - self.origin) / SPACING).astype(int) + 1
         self.clearance: Float = np.full((size[1], size[0]), _MAX_CLEARANCE)
         for wall in walls:
             self._add_wall(wall)
-
-    @property
-    def spacing(self) -> float:
-        """m between nodes."""
-        return _SPACING
 
     def with_walls(self, walls: Float) -> "FreeSpace":
         """The free space between these walls (W, 4), within the same bounds, and its own."""
@@ -58,18 +53,18 @@ class FreeSpace:
 
     def _add_wall(self, wall: Float) -> None:
         ends = wall.reshape(2, 2)
-        low = (ends.min(axis=0) - _MAX_CLEARANCE - self.origin) / _SPACING
-        high = (ends.max(axis=0) + _MAX_CLEARANCE - self.origin) / _SPACING
+        low = (ends.min(axis=0) - _MAX_CLEARANCE - self.origin) / SPACING
+        high = (ends.max(axis=0) + _MAX_CLEARANCE - self.origin) / SPACING
         (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int) + 2
         window = self.clearance[y0:y1, x0:x1]
         rows, columns = np.indices(window.shape)
-        nodes = self.origin + np.stack([columns + x0, rows + y0], axis=-1) * _SPACING
+        nodes = self.origin + np.stack([columns + x0, rows + y0], axis=-1) * SPACING
         np.minimum(window, compute_segment_distance(nodes, wall), out=window)
 
     def clearance_at(self, xy: Float) -> tuple[Float, Float]:
         """Clearance (N,) in metres at points (N, 2), bilinear, and its gradient (N, 2)."""
         H, W = self.clearance.shape
-        at = (xy - self.origin) / _SPACING
+        at = (xy - self.origin) / SPACING
         cell = np.clip(at.astype(np.int64), 0, (W - 2, H - 2))
         u, v = (at - cell).T
         column, row = cell.T
@@ -77,7 +72,7 @@ class FreeSpace:
         c01, c11 = self.clearance[row + 1, column], self.clearance[row + 1, column + 1]
         low, high = c00 + u * (c10 - c00), c01 + u * (c11 - c01)
         dx = (1 - v) * (c10 - c00) + v * (c11 - c01)
-        return low + v * (high - low), np.stack([dx, high - low], axis=-1) / _SPACING
+        return low + v * (high - low), np.stack([dx, high - low], axis=-1) / SPACING
 
 
 class Planner:
@@ -139,10 +134,10 @@ class Planner:
     def point(self, node: Int64) -> Float:
         """(..., 2) points in metres of the nodes (...)."""
         grid = np.stack([node % self._shape[1], node // self._shape[1]], axis=-1)
-        return np.asarray(self._space.origin + grid * (_SPACING * _STRIDE))
+        return np.asarray(self._space.origin + grid * (SPACING * _STRIDE))
 
     def _grid_node(self, xy: Float) -> int:
-        at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
+        at = np.round((xy - self._space.origin) / (SPACING * _STRIDE)).astype(int)
         column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
         return int(row) * int(self._shape[1]) + int(column)
 
@@ -172,9 +167,9 @@ class Planner:
     def is_visible(self, start: Float, ends: Float) -> Bool:
         """(K,) whether straight lines from a point (2,) to points (K, 2) keep the clearance."""
         delta = ends - start
-        steps = int(np.ceil(np.abs(delta).max(initial=0.0) / _SPACING)) + 1
+        steps = int(np.ceil(np.abs(delta).max(initial=0.0) / SPACING)) + 1
         along = start + delta[:, None, :] * np.linspace(0.0, 1.0, steps + 1)[1:, None]
-        cell = np.round((along - self._space.origin) / _SPACING).astype(np.int64)
+        cell = np.round((along - self._space.origin) / SPACING).astype(np.int64)
         H, W = self._clear.shape
         cell = np.clip(cell, 0, (W - 1, H - 1))
         return np.asarray(np.all(self._clear[cell[..., 1], cell[..., 0]], axis=1))
@@ -205,7 +200,7 @@ def _graph(part: Bool, clearance: Float, least: float) -> "scipy.sparse.csr_arra
         both = part[here] & part[there]
         rows.append(index[here][both])
         columns.append(index[there][both])
-        length = _SPACING * _STRIDE * np.hypot(dx, dy)
+        length = SPACING * _STRIDE * np.hypot(dx, dy)
         costs.append(length * (slow[here][both] + slow[there][both]) / 2)
     data = (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns)))
     return scipy.sparse.csr_array(data, shape=(np.count_nonzero(part),) * 2)

@@ -65,7 +65,10 @@ class Robot:
         past = (x - self._way[self._at, 0]) * np.cos(theta)
         past += (y - self._way[self._at, 1]) * np.sin(theta)
         speed = self._pace.limit_speed(self._at, float(past), self._speed, self._seconds, dt)
-        speed = self._pace.accelerate(speed * self._speed_share(error), self._speed, dt)
+        share = 1.0 - abs(error) / _TURN_IN_PLACE
+        if o.acceleration is not None:  # whoever brakes slowly turns in passing
+            share = min(1.0, 1.0 + share)
+        speed = self._pace.accelerate(speed * max(0.0, share), self._speed, dt)
         speed = self._give_way(dt, min(speed, np.hypot(*to) / dt), people, contact)
         middle = theta + turn * dt / 2
         new = np.array([x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle)])
@@ -123,13 +126,6 @@ class Robot:
         ahead = np.arange(self._at, self._at + count + 1)
         last = len(self._way) - 1
         return ahead % len(self._way) if self._closed else np.minimum(ahead, last)
-
-    def _speed_share(self, error: float) -> float:
-        """Share of its speed at a heading error in rad; larger if it brakes slowly."""
-        share = 1.0 - abs(error) / _TURN_IN_PLACE
-        if self._options.acceleration is not None:
-            share = min(1.0, 1.0 + share)
-        return max(0.0, share)
 
     def _fast(self) -> float:
         """m/s, the speed that determines how far it looks ahead."""

@@ -10,7 +10,7 @@ import scipy  # its parts load when they are first used
 
 from stillmap.core.array_types import Bool, Float
 from stillmap.sim.dynamics import place_faces
-from stillmap.sim.planner import FreeSpace, compute_segment_distance
+from stillmap.sim.planner import SPACING, FreeSpace, compute_segment_distance
 from stillmap.sim.scene import Door, Scene, Segment, Stay, Thing
 from stillmap.sim.walls import box
 from stillmap.sim.world_3d import trace_chains
@@ -167,7 +167,7 @@ class Floor:
     def _main_part(self, space: FreeSpace) -> Bool:
         """(H, W) nodes of the largest part of free space through which the robot gets."""
         parts, count = scipy.ndimage.label(space.clearance >= _WAY, structure=np.ones((3, 3)))
-        anchors = np.round((self._anchors - space.origin) / space.spacing).astype(int)
+        anchors = np.round((self._anchors - space.origin) / SPACING).astype(int)
         at = parts[anchors[:, 1], anchors[:, 0]]
         if not np.any(at > 0):
             return np.zeros(parts.shape, bool)
@@ -178,7 +178,7 @@ class Floor:
 def _points(space: FreeSpace, nodes: Bool) -> Float:
     """(K, 2) metres, of the nodes of a mask (H, W)."""
     rows, columns = np.nonzero(nodes)
-    return np.asarray(space.origin + np.column_stack([columns, rows]) * space.spacing)
+    return np.asarray(space.origin + np.column_stack([columns, rows]) * SPACING)
 
 
 def meets_box(solid: Float, place: Place, half: Float) -> bool:
@@ -221,8 +221,7 @@ class Layout:
             if loop is None or kind is None:
                 fixed += chain
                 continue
-            place = Place(loop.x, loop.y, loop.heading)
-            size = (loop.length, loop.width)
+            size, place = (loop.length, loop.width), Place(*loop[:3])
             self._boxes.append(StandingObject.of_box(kind, size, [place]))
         self.walls = tuple(fixed)
         keep_clear = [(*door.hinge, door.width + _DOOR_ROOM) for door in scene.leaves]

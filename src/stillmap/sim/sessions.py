@@ -70,7 +70,8 @@ def plan_sessions(
         scene: the world; its doors get a constant angle in each session.
         count: number of sessions.
         seed: of everything, the simulations too.
-        routes: of each session, gives a scene a route of some metres; none: `draw_route`.
+        routes: of each session, gives a scene a route of some metres; none: `draw_piece`
+            of a street, `draw_tour` indoors.
         has_odd_sensor: one session has half the beams or a narrower field of view.
 
     Raises:
@@ -100,7 +101,8 @@ def plan_sessions(
             lights=(),
             things=tuple(thing for thing in things if thing is not None),
         )
-        base = _send_robot(base, routes[session] if routes else draw_route, rng)
+        usual = draw_piece if _is_drive(scene) else draw_tour
+        base = _send_robot(base, routes[session] if routes else usual, rng)
         scenes.append(_mount_sensor(base, 0 < session == odd, rng))
         stamps.append((session * _DAY + int(rng.integers(0, _DAY // 3))) * 10**9)
     seeds = tuple(int(rng.integers(1 << 31)) for rng in rngs)
@@ -235,10 +237,8 @@ def list_changes(
             was, now = (_box_around(item, session, heights) for session in (after - 1, after))
             kind = "moved" if was and now else "gone" if was else "appeared"
             kind = "door" if item.kind == "door" else kind
-            from_box = was if now else None
-            changes.append(
-                TrueChange(number, kind, now or was, from_box or None, (after - 1, after))
-            )
+            from_box = (was if now else None) or None
+            changes.append(TrueChange(number, kind, now or was, from_box, (after - 1, after)))
     return changes
 
 
@@ -276,10 +276,9 @@ def _mount_sensor(scene: Scene, is_odd: bool, rng: np.random.Generator) -> Scene
     laser = replace(laser, x=laser.x + x, y=laser.y + y, yaw=laser.yaw + yaw)
     lidar = replace(lidar, x=lidar.x + x, y=lidar.y + y, yaw=lidar.yaw + yaw)
     if is_odd:
-        fov = laser.fov * (0.75 if narrow else 1.0)
-        laser = replace(
-            laser, fov=fov, beams=max(2, round(laser.beams * (0.75 if narrow else 0.5)))
-        )
+        fov, share = (0.75, 0.75) if narrow else (1.0, 0.5)
+        beams = max(2, round(laser.beams * share))
+        laser = replace(laser, fov=laser.fov * fov, beams=beams)
         lidar = replace(lidar, columns=max(4, lidar.columns // 2))
     return replace(scene, laser=laser, lidar=lidar)
 
@@ -287,11 +286,6 @@ def _mount_sensor(scene: Scene, is_odd: bool, rng: np.random.Generator) -> Scene
 def _is_drive(scene: Scene) -> bool:
     """True for a car, which keeps to the street."""
     return scene.robot.radius > 0.5
-
-
-def draw_route(scene: Scene, length: float, rng: np.random.Generator) -> Scene:
-    """The scene with a random route of `length` metres: a piece of a street, or a tour indoors."""
-    return (draw_piece if _is_drive(scene) else draw_tour)(scene, length, rng)
 
 
 def draw_tour(

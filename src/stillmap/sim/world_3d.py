@@ -1,12 +1,12 @@
 """3D worlds from plans: closed outlines become solids, other lines walls; movers get solids."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core.array_types import Float, Int64
+from stillmap.core.array_types import Float
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
@@ -69,29 +69,27 @@ def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
 
 def trace_loops(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
     """The closed outlines of objects in a plan, and the remaining lines."""
-    traced = list(trace_chains(walls))
+    traced = trace_chains(walls)
     lines = [segment for chain, loop in traced if loop is None for segment in chain]
     return [loop for _, loop in traced if loop is not None], lines
 
 
-def trace_chains(walls: Sequence[Segment]) -> Iterator[tuple[list[Segment], Loop | None]]:
-    """The chains of a plan in order, each with the outline that it closes, if it closes one."""
-    return ((chain, _loop(chain)) for chain in _chains(walls))
+def trace_chains(walls: Sequence[Segment]) -> list[tuple[list[Segment], Loop | None]]:
+    """The chains of a plan in order, each with the outline that it closes, if it closes one.
 
-
-def _chains(walls: Sequence[Segment]) -> Iterator[list[Segment]]:
-    """Consecutive segments, up to where an outline closes."""
-    chain: list[Segment] = []
+    A chain: consecutive segments, up to where an outline closes.
+    """
+    chains: list[list[Segment]] = [[]]
     for segment in walls:
-        if chain and not np.allclose(chain[-1][2:], segment[:2], rtol=0.0, atol=1e-6):
-            yield chain
-            chain = []
-        chain.append(segment)
-        if np.allclose(chain[0][:2], segment[2:], rtol=0.0, atol=1e-6):
-            yield chain
-            chain = []
-    if chain:
-        yield chain
+        last = chains[-1]
+        if last and (_meet(last[0][:2], last[-1][2:]) or not _meet(last[-1][2:], segment[:2])):
+            chains.append([])
+        chains[-1].append(segment)
+    return [(chain, _loop(chain)) for chain in chains if chain]
+
+
+def _meet(a: Sequence[float], b: Sequence[float]) -> bool:
+    return np.allclose(a, b, rtol=0.0, atol=1e-6)
 
 
 def _loop(chain: list[Segment]) -> Loop | None:
@@ -225,10 +223,6 @@ class World(NamedTuple):
         robot = _shake(episode.motion.robot, ground, scene.lidar, rng)
         return cls(episode, make_static_world(scene, ground), movers, robot)
 
-    def moment(self, scans: Int64, seconds: Float) -> Moment:
-        """N times: `seconds` after the stamps of scans."""
-        return Moment(self.episode.motion, scans, seconds)
-
     def T_world_base(self, moment: Moment) -> Float:
         """(N, 4, 4) pose of the robot at the times of a moment."""
         x, y, z, *angles = moment.interpolate(self.robot).T
@@ -238,7 +232,8 @@ class World(NamedTuple):
         """The surfaces at the stamps of the scans; movers that never moved are static."""
         poses = []
         for scan in range(len(self.robot)):
-            solids = self.movers.at(self.moment(np.array([scan]), np.zeros(1)), scan)
+            moment = Moment(self.episode.motion, np.array([scan]), np.zeros(1))
+            solids = self.movers.at(moment, scan)
             poses.append(solids.pose[0])
         solids = solids._replace(pose=np.stack(poses))
         moves = solids.mover >= 0
