@@ -27,7 +27,7 @@ def _room(scans, max_range):
     return simulate(scene, np.random.default_rng(4))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def room():
     """60 scans of 120 beams, three people, some beams at maximum range."""
     simulation = _room(60, 7.0)
@@ -36,7 +36,7 @@ def room():
     return simulation
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def short():
     """The same with 6 scans."""
     return _room(6, 7.0)

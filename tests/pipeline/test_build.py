@@ -2,10 +2,11 @@
 
 import dataclasses
 import math
+import operator
 
 import numpy as np
 import pytest
-from choices import RESOLUTION, options, with_any_estimator
+from choices import ESTIMATORS, RESOLUTION, options, with_any_estimator
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import stillmap
@@ -16,10 +17,7 @@ from stillmap.tracking.motion_evidence import apply_motion_evidence
 
 def end_cells(recording, poses, origin, resolution, beams):
     """(row, column) of the end points of these beams, straight from geometry."""
-    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))[beams]
-    T = (poses @ recording.T_base_sensor[recording.sensor])[scan]
-    points = recording.points[beams].astype(float)
-    ends = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
+    ends = recording.end_points(np.flatnonzero(beams), poses)
     first = np.round(np.array(origin[:2]) / resolution)
     column, row = (np.floor(ends / resolution) - first).astype(int).T
     return row, column
@@ -62,9 +60,8 @@ def test_the_printed_labels_follow_from_the_map(room, prior, fixed):
     chosen = options("paper", max_iterations=3, prior=prior)
     result = stillmap.build(recording, chosen, poses=poses)
     m = result.map
-    expected = expected_labels(
-        recording, result.poses, m.alpha, m.beta, m.origin, m.resolution, prior
-    )
+    grid = m.alpha, m.beta, m.origin, m.resolution
+    expected = expected_labels(recording, result.poses, *grid, prior)
     assert result.p_static.dtype == np.float32
     np.testing.assert_allclose(result.p_static, expected, atol=1e-6)
     assert np.isnan(result.p_static[100:110]).all()
@@ -114,15 +111,8 @@ def test_the_labels_written_follow_from_the_map_written(room, tmp_path):
     arrays = np.load(tmp_path / "out/map.npz")
     _, T = read_tum(tmp_path / "out/trajectory.tum")
     poses = T[:, [0, 1, 3]][:, :, [0, 1, 3]]
-    expected = expected_labels(
-        room.recording,
-        poses,
-        arrays["alpha"],
-        arrays["beta"],
-        arrays["origin"],
-        float(arrays["resolution"]),
-        0.8,
-    )
+    grid = (arrays[name] for name in ("alpha", "beta", "origin", "resolution"))
+    expected = expected_labels(room.recording, poses, *grid, 0.8)
     written = np.load(tmp_path / "out/beams/p_static.npy")
     # a trajectory of nine digits may move one end point in a thousand across an edge
     off = np.abs(written - expected) > 1e-6
@@ -130,9 +120,13 @@ def test_the_labels_written_follow_from_the_map_written(room, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "out/beams/hit.npy"), room.recording.hit)
 
 
-@with_any_estimator
-def test_the_looks_that_the_map_rests_on(room, estimator, tmp_path):
-    result = stillmap.build(room.recording, options(estimator, max_iterations=1))
+@pytest.fixture(scope="module", params=ESTIMATORS)
+def mapped(room, request):
+    return stillmap.build(room.recording, options(request.param, max_iterations=2))
+
+
+def test_the_looks_that_the_map_rests_on(room, mapped, tmp_path):
+    result, estimator = mapped, mapped.options.estimator
     found, known = result.evidence, ~np.isnan(result.map.p_occupied)
     assert found.observations.shape == known.shape
     # to the cell: what is known has been looked at, and nothing else has
@@ -143,19 +137,22 @@ def test_the_looks_that_the_map_rests_on(room, estimator, tmp_path):
     assert "evidence" in result.stages
     if estimator == "stillmap":  # the others call too few of the beams dynamic at first
         assert (found.unobstructed < found.observations).any()
-    threaded = stillmap.build(
-        room.recording, dataclasses.replace(result.options, threads=3), poses=result.poses
+    one, three = (
+        dataclasses.replace(options(estimator, max_iterations=1), threads=threads)
+        for threads in (1, 3)
     )
-    np.testing.assert_array_equal(found.unobstructed, threaded.evidence.unobstructed)
+    counts = [
+        stillmap.build(room.recording, chosen, poses=result.poses).evidence.unobstructed
+        for chosen in (one, three)
+    ]
+    np.testing.assert_array_equal(*counts)
     result.save(tmp_path / "out")
-    np.testing.assert_array_equal(
-        np.load(tmp_path / "out/map.npz")["clear_looks"], found.unobstructed
-    )
+    written = np.load(tmp_path / "out/map.npz")["clear_looks"]
+    np.testing.assert_array_equal(written, found.unobstructed)
 
 
-@with_any_estimator
-def test_unknown_stays_nan(room, estimator):
-    m = stillmap.build(room.recording, options(estimator, max_iterations=2)).map
+def test_unknown_stays_nan(mapped):
+    m, estimator = mapped.map, mapped.options.estimator
     unknown = np.isnan(m.p_occupied)
     crossed = m.alpha + m.beta > 0
     assert not crossed.all()
@@ -209,10 +206,8 @@ def test_unknown_is_what_no_beam_saw(room, estimator):
     assert floor < 0.1
 
 
-@with_any_estimator
-def test_the_raw_map_counts_every_hit_as_static(room, estimator):
-    result = stillmap.build(room.recording, options(estimator, max_iterations=2))
-    raw, hit = result.raw_map, room.recording.hit
+def test_the_raw_map_counts_every_hit_as_static(room, mapped):
+    result, raw, hit = mapped, mapped.raw_map, room.recording.hit
     counts = np.zeros(raw.alpha.shape)
     cells = end_cells(room.recording, result.poses, raw.origin, raw.resolution, hit)
     np.add.at(counts, cells, 1.0)
@@ -220,7 +215,7 @@ def test_the_raw_map_counts_every_hit_as_static(room, estimator):
     assert raw.alpha.sum() == hit.sum()
     # its beta is the way that beams went through: no dynamic hit is in it
     alpha, beta = part(raw, result.map)
-    if estimator != "hit-ratio":
+    if result.options.estimator != "hit-ratio":
         assert beta.sum() < result.map.beta.sum()
     np.testing.assert_allclose(result.map.alpha + result.map.beta, alpha + beta, atol=1e-4)
 
@@ -287,25 +282,17 @@ def test_one_e_step_of_all_ones_is_the_raw_map(room):
     # a prior of almost 1 leaves nothing to be dynamic in the first iteration
     sure = options("paper", prior=1 - 1e-7)
     first = next(stillmap.iterate(room.recording, sure, poses=room.truth.T_world_base))
-    result = stillmap.build(
-        room.recording, options(max_iterations=1), poses=room.truth.T_world_base
-    )
+    chosen = options(max_iterations=1)
+    result = stillmap.build(room.recording, chosen, poses=room.truth.T_world_base)
     alpha, beta = part(first.occupancy, result.raw_map)
     np.testing.assert_allclose(alpha, result.raw_map.alpha, atol=1e-4)
     np.testing.assert_allclose(beta, result.raw_map.beta, atol=1e-4)
 
 
 def same(a, b):
-    for x, y in (
-        (a.poses, b.poses),
-        (a.estimate.m_step.covariance, b.estimate.m_step.covariance),
-        (a.p_static, b.p_static),
-        (a.map.alpha, b.map.alpha),
-        (a.map.beta, b.map.beta),
-        (a.map.p_occupied, b.map.p_occupied),
-        (a.raw_map.alpha, b.raw_map.alpha),
-        (a.raw_map.beta, b.raw_map.beta),
-    ):
+    names = ("poses", "estimate.m_step.covariance", "p_static", "map.alpha", "map.beta")
+    get = operator.attrgetter(*names, "map.p_occupied", "raw_map.alpha", "raw_map.beta")
+    for x, y in zip(get(a), get(b), strict=True):
         assert x.tobytes() == y.tobytes()
     assert [it.bound for it in a.iterations] == [it.bound for it in b.iterations]
     assert a.best_iteration == b.best_iteration
@@ -327,16 +314,13 @@ def test_the_same_to_the_bit_with_any_number_of_threads(room, fixed, estimator):
 
 def test_the_order_of_memory_does_not_matter(room):
     # as from a memory map: arrays that cannot be written to
-    frozen = {
-        name: getattr(room.recording, name).copy() for name in ("points", "hit", "offset", "sensor")
-    }
+    names = ("points", "hit", "offset", "sensor")
+    frozen = {name: getattr(room.recording, name).copy() for name in names}
     for array in frozen.values():
         array.setflags(write=False)
+    read_only = dataclasses.replace(room.recording, **frozen)
     chosen = options(max_iterations=2)
-    same(
-        stillmap.build(room.recording, chosen),
-        stillmap.build(dataclasses.replace(room.recording, **frozen), chosen),
-    )
+    same(*(stillmap.build(recording, chosen) for recording in (room.recording, read_only)))
 
 
 def test_linear_algebra_has_one_thread_while_a_job_is_done(room):

@@ -10,10 +10,11 @@ from choices import options
 from scipy.spatial import cKDTree
 
 import stillmap
-from stillmap.core.recording import Recording
+from stillmap.core.config import override
 from stillmap.io.point_cloud.ply import read_layout
 from stillmap.io.trajectory import read_tum, write_tum
 from stillmap.results.point_cloud import cloud_from_folder
+from stillmap.results.writer import crop_result
 from stillmap.sim import scene_by_name, simulate
 
 UTM = np.array([477_123.4567, 5_312_345.678, 812.345])
@@ -40,23 +41,18 @@ def lidar():
 
 def require_shifted(far, near, dimension):
     """The same labels and map, at poses shifted by UTM."""
-    np.testing.assert_allclose(
-        far.poses[:, :-1, -1] - UTM[:dimension], near.poses[:, :-1, -1], rtol=0, atol=1e-6
-    )
+    places = far.poses[:, :-1, -1] - UTM[:dimension]
+    np.testing.assert_allclose(places, near.poses[:, :-1, -1], rtol=0, atol=1e-6)
     np.testing.assert_allclose(far.p_static, near.p_static, rtol=0, atol=1e-5)
-    assert far.map.p_occupied.shape == near.map.p_occupied.shape
-    np.testing.assert_allclose(
-        np.asarray(far.map.p_occupied), np.asarray(near.map.p_occupied), rtol=0, atol=1e-5
-    )
-    np.testing.assert_allclose(
-        np.array(far.map.origin[:2]) - UTM[:2], near.map.origin[:2], atol=1e-8
-    )
+    maps = (np.asarray(one.map.p_occupied) for one in (far, near))
+    np.testing.assert_allclose(*maps, rtol=0, atol=1e-5)
+    corner = np.array(far.map.origin[:2]) - UTM[:2]
+    np.testing.assert_allclose(corner, near.map.origin[:2], atol=1e-8)
     assert len(far.objects) == len(near.objects)
     for one, other in zip(far.objects, near.objects, strict=True):
         np.testing.assert_allclose(one.xy - UTM[:2], other.xy, rtol=0, atol=1e-5)
-    assert [(c.kind, len(c.cells)) for c in far.mapping.changes] == [
-        (c.kind, len(c.cells)) for c in near.mapping.changes
-    ]
+    ours, theirs = ([(c.kind, len(c.cells)) for c in one.mapping.changes] for one in (far, near))
+    assert ours == theirs
 
 
 def test_a_planar_laser(room, tmp_path):
@@ -70,9 +66,8 @@ def test_a_planar_laser(room, tmp_path):
     for name, result in (("near", near), ("far", far)):
         result.save(tmp_path / name)
     maps = [yaml.safe_load((tmp_path / name / "map.yaml").read_text()) for name in ("near", "far")]
-    np.testing.assert_allclose(
-        np.array(maps[1]["origin"][:2]) - maps[0]["origin"][:2], UTM[:2], atol=1e-8
-    )
+    apart = np.subtract(maps[1]["origin"][:2], maps[0]["origin"][:2])
+    np.testing.assert_allclose(apart, UTM[:2], atol=1e-8)
     pixels = [(tmp_path / name / "map.pgm").read_bytes() for name in ("near", "far")]
     assert pixels[0] == pixels[1]
     changed = [np.load(tmp_path / name / "map.npz")["changed"] for name in ("near", "far")]
@@ -108,14 +103,10 @@ def test_a_lidar(lidar, tmp_path):
 
 
 def test_a_region_is_in_the_map_frame(room):
-    chosen = dataclasses.replace(options(max_iterations=1))
     region = (UTM[0] - 1.0, UTM[1] - 1.0, UTM[0] + 2.0, UTM[1] + 1.5)
-    output = dataclasses.replace(chosen.output, region=region)
-    chosen = dataclasses.replace(chosen, output=output)
+    chosen = override(options(max_iterations=1), {"output": {"region": region}})
     poses = shift(from_zero(room.truth.T_world_base))
     result = stillmap.build(room.recording, chosen, poses=poses)
-    from stillmap.results.writer import crop_result
-
     cropped = crop_result(result.mapping)
     assert cropped.map.origin[:2] == pytest.approx(region[:2], abs=1e-6)
     assert cropped.map.p_occupied.shape == (50, 60)
@@ -149,9 +140,8 @@ def test_clouds_in_a_map_projection(tmp_path):
     recording = stillmap.read(tmp_path / "clouds")
     result = stillmap.build(recording, {"threads": 1})
     result.save(tmp_path / "out")
-    points = np.concatenate(
-        [block.points for block in cloud_from_folder(tmp_path / "out").iter_blocks()]
-    )
+    blocks = cloud_from_folder(tmp_path / "out").iter_blocks()
+    points = np.concatenate([block.points for block in blocks])
     apart, _ = cKDTree(walls).query(points - UTM)
     assert len(points) == len(walls)
     assert apart.max() < 1e-3
@@ -166,8 +156,8 @@ def test_a_trajectory_that_was_written_is_read_again(room, tmp_path):
 
 
 def test_absurd_poses_are_refused(room, tmp_path):
-    recording: Recording = room.recording  # type: ignore[attr-defined]
-    poses = shift(room.truth.T_world_base, 1e10 * np.ones(3))  # type: ignore[attr-defined]
+    recording = room.recording
+    poses = shift(room.truth.T_world_base, 1e10 * np.ones(3))
     with pytest.raises(ValueError, match=r"(?s)poses: expected numbers below 1e\+09, got .* at 0"):
         stillmap.build(recording, poses=poses)
     write_tum(tmp_path / "poses.tum", recording.stamp_ns, poses)

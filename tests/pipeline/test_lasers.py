@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 import stillmap
 from stillmap.core import se2
@@ -61,9 +62,8 @@ def mapped(tmp_path):
         simulations = list(lasers.values())
         lines = [f"PARAM {param}" for param in params]
         for scan in range(simulations[0].recording.n_scans):
-            lines += [
-                reading_line(kind, one, scan, kind in flipped) for kind, one in lasers.items()
-            ]
+            for kind, one in lasers.items():
+                lines.append(reading_line(kind, one, scan, kind in flipped))
         path = tmp_path / "some.log"
         path.write_text("".join(f"{line}\n" for line in lines))
         recording = read(path, ReadOptions(**options))
@@ -91,37 +91,9 @@ def good():
     return max(1.5 * ate(found.poses, centred.truth.T_world_base), 0.01)
 
 
-@pytest.mark.slow
-def test_off_centre_by_params(mapped, good):
-    assert mapped({"FLASER": seen(**FRONT)}, FRONT_PARAMS) < good
-
-
-def test_off_centre_by_options(mapped, good):
-    assert mapped({"FLASER": seen(**FRONT)}, **FRONT_OPTIONS) < good
-
-
 def test_it_matters_where_it_sits(mapped, good):
     wrong = dict.fromkeys(FRONT_OPTIONS, 0.0)
     assert mapped({"FLASER": seen(**FRONT)}, **wrong) > 2 * good
-
-
-def test_untold_it_is_found(mapped, good):
-    assert mapped({"FLASER": seen(**FRONT)}) < good
-
-
-@pytest.mark.slow
-def test_backwards(mapped, good):
-    assert mapped({"RLASER": seen(**REAR)}, [REAR_PARAM]) < good
-
-
-def test_upside_down_by_option(mapped, good):
-    assert mapped({"FLASER": seen()}, flipped=["FLASER"], laser_upside_down=True) < good
-
-
-@pytest.mark.slow
-def test_upside_down_and_off_centre_by_params(mapped, good):
-    params = [*FRONT_PARAMS, "robot_frontlaser_flipped 1"]
-    assert mapped({"FLASER": seen(**FRONT)}, params, ["FLASER"]) < good
 
 
 @pytest.mark.slow
@@ -130,31 +102,32 @@ def test_upside_down_said_wrongly(mapped, good):
     assert mapped({"FLASER": seen()}, **wrong) > 10 * good
 
 
-@pytest.mark.slow
-def test_upside_down_and_nobody_says_so(mapped, good):
-    assert mapped({"FLASER": seen()}, flipped=["FLASER"]) < good
+REAR_OPTIONS = {"laser2_x": -0.2, "laser2_theta": math.pi}
+BOTH_PARAMS = [*FRONT_PARAMS, REAR_PARAM, "robot_rearlaser_flipped 1"]
+WIDE = {"fov": math.radians(270), "beams": 271}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("degrees", "beams"), [(90, 91), (270, 271), (360, 361)])
-def test_fields_of_view(mapped, good, degrees, beams):
-    laser = seen(fov=math.radians(degrees), beams=beams)
-    assert mapped({"RAWLASER1": laser}) < good
-
-
-def test_a_field_of_view_that_lines_do_not_state(mapped, good):
-    fov = math.radians(270)
-    assert mapped({"FLASER": seen(fov=fov, beams=271)}, laser_fov=fov) < good
-
-
-def test_front_and_rear_the_rear_one_upside_down(mapped, good):
-    lasers = {"FLASER": seen(**FRONT), "RLASER": seen(**REAR)}
-    params = [*FRONT_PARAMS, REAR_PARAM, "robot_rearlaser_flipped 1"]
-    assert mapped(lasers, params, ["RLASER"]) < good
-
-
-@pytest.mark.slow
-def test_two_raw_lasers_told_by_options(mapped, good):
-    lasers = {"RAWLASER1": seen(**FRONT), "RAWLASER3": seen(**REAR)}
-    rear = {"laser2_x": -0.2, "laser2_theta": math.pi}
-    assert mapped(lasers, **FRONT_OPTIONS, **rear) < good
+@pytest.mark.parametrize(
+    ("lasers", "params", "flipped", "options"),
+    [
+        ({"FLASER": FRONT}, (), (), FRONT_OPTIONS),
+        ({"FLASER": FRONT}, (), (), {}),  # found
+        ({"FLASER": {}}, (), ["FLASER"], {"laser_upside_down": True}),
+        ({"FLASER": WIDE}, (), (), {"laser_fov": WIDE["fov"]}),  # lines do not state it
+        ({"FLASER": FRONT, "RLASER": REAR}, BOTH_PARAMS, ["RLASER"], {}),
+        *slow_params(
+            ({"FLASER": FRONT}, FRONT_PARAMS, (), {}),
+            ({"RLASER": REAR}, [REAR_PARAM], (), {}),
+            ({"FLASER": FRONT}, [*FRONT_PARAMS, "robot_frontlaser_flipped 1"], ["FLASER"], {}),
+            ({"FLASER": {}}, (), ["FLASER"], {}),  # nobody says so
+            ({"RAWLASER1": FRONT, "RAWLASER3": REAR}, (), (), {**FRONT_OPTIONS, **REAR_OPTIONS}),
+            *(
+                ({"RAWLASER1": {"fov": math.radians(degrees), "beams": degrees + 1}}, (), (), {})
+                for degrees in (90, 270, 360)
+            ),
+        ),
+    ],
+)
+def test_wherever_a_laser_sits_poses_are_as_good(mapped, good, lasers, params, flipped, options):
+    placed = {kind: seen(**mount) for kind, mount in lasers.items()}
+    assert mapped(placed, params, flipped, **options) < good

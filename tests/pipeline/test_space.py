@@ -114,18 +114,15 @@ def test_what_was_learned_is_of_all_classes(street, mapped):
     hits = np.flatnonzero(recording.hit)
     ends = recording.end_points(hits, street.truth.T_world_base)
     _, cell = np.unique(np.floor(ends / voxel), axis=0, return_inverse=True)
-    static = np.bincount(cell.reshape(-1), street.truth.static[hits]) / np.bincount(
-        cell.reshape(-1)
-    )
+    cell = cell.reshape(-1)
+    static = np.bincount(cell, street.truth.static[hits]) / np.bincount(cell)
     assert mapped.learned["p_static"] == pytest.approx((static > 0.5).mean(), abs=0.1)
     assert 0.0 < mapped.learned["changing"] < 0.2
     missed = ~recording.hit & np.isfinite(mapped.p_static)
     assert mapped.p_static[missed] == pytest.approx(mapped.learned["p_static"])
     report = render_report(mapped)
-    assert (
-        f"{100 * mapped.learned['p_static']:.1f} % of the cells in which beams ended are static"
-        in report
-    )
+    percent = f"{100 * mapped.learned['p_static']:.1f} %"
+    assert f"{percent} of the cells in which beams ended are static" in report
     assert "put down or taken away" in " ".join(report.split())
     unasked = {k: v for k, v in mapped.learned.items() if k != "changing"}
     estimate = mapped.estimate.with_labels(learned=unasked)
@@ -144,13 +141,10 @@ def test_any_number_of_threads_gives_the_same_bytes(street, mapped, threads):
 
 def test_cars_are_objects_with_heights(street, mapped):
     kinds = np.array(street.truth.scene["mover_kinds"])
-    car = [
-        one
-        for one in mapped.objects
-        if (kinds[street.truth.mover[one.beams]] == "car").mean() > 0.8 and len(one.beams) > 500
-    ]
-    assert car
-    for one in car:
+    large = [one for one in mapped.objects if len(one.beams) > 500]
+    cars = [one for one in large if (kinds[street.truth.mover[one.beams]] == "car").mean() > 0.8]
+    assert cars
+    for one in cars:
         assert len(one.size) == 3
         assert 0.5 < one.size[2] < 2.5
         assert one.z.shape == (len(one.scan),)
@@ -197,11 +191,8 @@ def test_the_printed_method_runs_in_3d():
     lidar = {"channels": 16, "columns": 300, "sweep": False}
     scene = scene_by_name("street", {"lidar": lidar, "robot": {"scans": 10}})
     street = simulate(scene, 3)
-    result = stillmap.build(
-        street.recording,
-        options(estimator="paper", max_iterations=2),
-        poses=street.truth.T_world_base,
-    )
+    chosen = options(estimator="paper", max_iterations=2)
+    result = stillmap.build(street.recording, chosen, poses=street.truth.T_world_base)
     assert len(result.iterations) == 2
     assert np.isfinite(result.p_static[street.recording.hit]).all()
 
@@ -212,12 +203,8 @@ def test_sweeps_that_say_nothing_are_mapped_all_the_same(how, given, tmp_path):
     n = 0 if how == "none" else 50
     points = np.zeros((5 * n, 3), np.float32)
     points[:, 0] = {"nothing came back": 30.0, "all unusable": np.nan}.get(how, 0.0)
-    recording = of_one_sensor(
-        np.arange(5, dtype=np.int64) * 10**8,
-        np.arange(6, dtype=np.int64) * n,
-        points,
-        np.full(5 * n, how == "all at the sensor"),
-    )
+    hit = np.full(5 * n, how == "all at the sensor")
+    recording = of_one_sensor(np.arange(5) * 10**8, np.arange(6) * n, points, hit)
     poses = np.tile(np.eye(4), (5, 1, 1)) if given else None
     result = stillmap.build(recording, poses=poses)
     assert np.isfinite(result.poses).all()

@@ -17,14 +17,9 @@ from stillmap.pipeline.options import Options
 
 def options(estimator="stillmap", **changes):
     """Without the last E-step, which asks the recording once more."""
-    wanted = {
-        "max_iterations": 10,
-        "tolerance": 0.0,
-        "label_tolerance": 0.0,
-        "patience": 3,
-    } | changes
-    wanted |= {"change_detection": False}
-    chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
+    usual = {"max_iterations": 10, "tolerance": 0.0, "label_tolerance": 0.0, "patience": 3}
+    em_options = {**usual, **changes, "change_detection": False}
+    chosen = {"estimator": estimator, "em": em_options, "slam": {"resolution": 0.1}, "threads": 1}
     return override(Options(), chosen)
 
 
@@ -105,71 +100,46 @@ def test_the_best_iterate_is_kept_whole(build, bounds, best, estimator):
     assert not result.converged
 
 
-def test_counting_has_nothing_to_iterate(build):
-    result, asked = build([-5.0, -4.0, -3.0], options("hit-ratio"))
-    assert (asked, result.converged) == (1, True)
-
-
-def test_tracking_is_done_twice_and_the_second_time_counts(build):
-    result, asked = build([-3.0, -4.0, -5.0], options("tracker"))
-    assert (asked, result.converged) == (2, True)
-    assert_kept(result, 2)
-    once, asked = build([-3.0, -4.0], options("tracker", max_iterations=1))
-    assert (asked, once.converged) == (1, False)
-
-
-def test_the_held_out_score_decides(build):
-    held_out = [1.0, 1.2, 1.1]
-    result, _ = build([-3.0, -4.0, -2.0], options(), held_out_log_likelihood=held_out)
-    assert_kept(result, 2)
-    # the printed method maximises the bound
-    result, _ = build([-3.0, -4.0, -2.0], options("paper"), held_out_log_likelihood=held_out)
-    assert_kept(result, 3)
-
-
-def test_a_held_out_gain_below_the_tolerance_ends_it(build):
-    held_out = [1.0, 1.005, 2.0]
-    chosen = options(tolerance=0.01)
-    result, asked = build([-5.0, -4.0, -3.0], chosen, held_out_log_likelihood=held_out)
-    assert (asked, result.converged) == (2, True)
-
-
-def test_scans_that_no_label_touches_end_it(build):
-    chosen, bounds = options(label_tolerance=1e-6), [-5.0, -4.0, -3.0]
-    result, asked = build(bounds, chosen, touched_share=[0.5, 0.099, 0.5])
-    assert (asked, result.converged) == (2, True)
-    result, asked = build(bounds, chosen, touched_share=[0.01, 0.5, 0.5])
-    assert (asked, result.converged) == (1, True)
-    for share, other in ((0.1, chosen), (0.0, options(label_tolerance=0.0))):
-        result, asked = build(bounds, other, touched_share=[share] * 3)
-        assert (asked, result.converged) == (3, False)
-
-
-def test_a_gain_below_the_tolerance_ends_it(build):
-    result, asked = build([-5.0, -4.0, -3.995, -3.0], options(tolerance=0.01))
-    assert (asked, result.converged) == (3, True)
-    assert_kept(result, 3)
-
-
-def test_a_dip_alone_does_not_end_it(build):
-    result, asked = build([-5.0, -4.0, -4.001, -3.0], options(tolerance=0.01, patience=2))
-    assert asked == 4
-    assert_kept(result, 4)
-
-
+HELD_OUT, SCORES = "held_out_log_likelihood", [1.0, 1.2, 1.1]
+FALLING, DIP = [-3.0, -4.0, -5.0, -6.0, -1.0], [-5.0, -4.0, -4.001, -3.0]
 RISING = [-5.0, -4.0, -3.0, -2.0]
+SETTLED = {"changed": [0.5, 0.02, 0.009, 0.0]}
 
 
-def test_labels_that_have_settled_end_it(build):
-    result, asked = build(RISING, options(label_tolerance=0.01), [0.5, 0.02, 0.009, 0.0])
-    assert (asked, result.converged) == (3, True)
-    assert_kept(result, 3)
-
-
-def test_patience_ends_it(build):
-    result, asked = build([-3.0, -4.0, -5.0, -6.0, -1.0], options(patience=2))
-    assert (asked, result.converged) == (3, True)
-    assert_kept(result, 1)
+@pytest.mark.parametrize(
+    ("bounds", "chosen", "records", "asked", "converged", "kept"),
+    [
+        # counting has nothing to iterate; tracking is done twice, and the second time counts
+        (RISING, ("hit-ratio", {}), {}, 1, True, None),
+        (FALLING, ("tracker", {}), {}, 2, True, 2),
+        (FALLING, ("tracker", {"max_iterations": 1}), {}, 1, False, None),
+        # the held-out score decides; the printed method maximises the bound
+        ([-3.0, -4.0, -2.0], ("stillmap", {}), {HELD_OUT: SCORES}, 3, False, 2),
+        ([-3.0, -4.0, -2.0], ("paper", {}), {HELD_OUT: SCORES}, 3, False, 3),
+        # a gain below the tolerance ends it, a dip alone does not
+        (RISING, ("stillmap", {"tolerance": 0.01}), {HELD_OUT: [1.0, 1.005, 2.0]}, 2, True, None),
+        ([-5.0, -4.0, -3.995, -3.0], ("stillmap", {"tolerance": 0.01}), {}, 3, True, 3),
+        (DIP, ("stillmap", {"tolerance": 0.01, "patience": 2}), {}, 4, False, 4),
+        (FALLING, ("stillmap", {"patience": 2}), {}, 3, True, 1),
+        # so do labels that have settled, and scans that no label touches
+        (RISING, ("stillmap", {"label_tolerance": 0.01}), SETTLED, 3, True, 3),
+        *(
+            (RISING[:3], ("stillmap", {"label_tolerance": least}), {"touched_share": share}, *ends)
+            for least, share, *ends in (
+                (1e-6, [0.5, 0.099, 0.5], 2, True, None),
+                (1e-6, [0.01, 0.5, 0.5], 1, True, None),
+                (1e-6, [0.1] * 3, 3, False, None),
+                (0.0, [0.0] * 3, 3, False, None),
+            )
+        ),
+    ],
+)
+def test_what_ends_it(build, bounds, chosen, records, asked, converged, kept):
+    estimator, changes = chosen
+    result, found = build(bounds, options(estimator, **changes), **records)
+    assert (found, result.converged) == (asked, converged)
+    if kept is not None:
+        assert_kept(result, kept)
 
 
 @pytest.mark.parametrize("bounds", [[-5.0, -3.0, -4.0, -2.0, -2.5], [-3.0, -4.0, -5.0], [-5.0]])
