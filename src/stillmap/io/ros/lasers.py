@@ -185,8 +185,8 @@ class LaserCollector:
             raise InputError(f"holds no usable laser scan: {total.summary('message')}")
         for laser in self._lasers.values():
             laser.finish(self.skipped[laser.topic])
-        first_first = {s: -len(s.raw.directions[s.raw.shape[0]]) for s in self._lasers.values()}
-        return sorted(first_first, key=lambda s: (-s.n_scans, first_first[s], s.topic))
+        beams = {s: len(s.raw.directions[s.raw.shape[0]]) for s in self._lasers.values()}
+        return sorted(beams, key=lambda s: (-s.n_scans, -beams[s], s.topic))
 
 
 def _first_echoes(scan: Any) -> NDArray[np.float32]:
