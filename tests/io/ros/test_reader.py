@@ -232,3 +232,16 @@ def test_echoes(bag, messages):
     length = np.linalg.norm(recording.points[:5], axis=1)
     np.testing.assert_array_equal(recording.hit[:5], [1, 0, 1, 0, 1])
     np.testing.assert_allclose(length[[0, 2, 4]], [1.0, 2.0, 4.0], rtol=1e-6)
+
+
+def test_damaged_mounts_of_the_first_part_are_passed_over(bag, messages):
+    """Those after them count, as they do where the part itself is read."""
+    content = drive(messages, 20)
+    static, cut = content[0], START + 19 * SECOND // 20
+    kind, _ = static[2]
+    damaged = ("/tf_static", START - SECOND, (kind, b"\x01\x02\x03"))
+    first = [damaged, *(one for one in content if one[1] < cut)]
+    second = [one for one in content if one[1] >= cut]
+    recording = inputs.read([bag(first, "first"), bag(second, "second")])
+    assert recording.n_scans == 20
+    np.testing.assert_allclose(se2.parameters(recording.T_base_sensor), [[0.2, 0, 0]], atol=1e-9)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -124,7 +124,8 @@ def _lend_transforms(tree: TransformTree, others: Sequence[Path], scratch: Path 
         try:
             with closing(open_bag([path], scratch, trusted=True)) as bag:
                 for message in bag.messages(_static_topics(bag)):
-                    tree.add_message(decode(message), static=True)
+                    with suppress(Exception):  # any error of rosbags about damaged bytes
+                        tree.add_message(decode(message), static=True)
                 if _static_topics(bag):
                     return
         except (DamagedBagError, InputError, OSError):
