@@ -169,7 +169,7 @@ def test_a_place_is_shown(merged):
     )
     page = merged._repr_html_()
     assert "src='data:image/png;base64," in page
-    assert "200 in 39.6 s" in page  # not the day between them
+    assert "2 of 2 sessions with 200 scans" in page
     assert len(repr(merged.sessions[0])) < 400
 
 

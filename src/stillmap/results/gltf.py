@@ -8,7 +8,7 @@ import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +27,6 @@ _VERTICES, _INDICES = 34962, 34963  # targets of glTF buffer views
 _FAR = 1000.0  # m, coordinates from which on 32-bit floats are coarse
 
 
-class _Part(NamedTuple):
-    """The faces of one texture page, or the gray ones (page -1), with their own vertices."""
-
-    page: int
-    vertices: Float
-    faces: NDArray[np.int64]
-    uv: Float
-
-
 def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
     """Writes binary glTF: one unlit mesh per page, and one lit mesh of the gray faces.
 
@@ -52,16 +43,17 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
     """
     trimesh = import_extra("trimesh", path, "written", group="mesh")
     gltf = import_extra("trimesh.exchange.gltf", path, "written", group="mesh")
-    parts = _split_pages(mesh)
-    shift, move = np.zeros(3), np.eye(4)
+    parts, shift, move = _split_pages(mesh), np.zeros(3), np.eye(4)
     if np.abs(mesh.vertices[mesh.faces]).max(initial=0.0) > _FAR:
-        shift = np.rint(np.mean([part.vertices.mean(axis=0) for part in parts], axis=0))
+        shift = np.rint(np.mean([mesh.vertices[used].mean(axis=0) for _, used, _ in parts], axis=0))
     move[:3, 3] = _y_up(shift)
     scene = trimesh.Scene()
-    for part in parts:
-        vertices, name = _y_up(part.vertices - shift), _name(part.page)
-        visual = _visual(trimesh, part)
-        geometry = trimesh.Trimesh(vertices, part.faces, visual=visual, process=False)
+    for page, used, faces in parts:
+        name = f"page{page}" if page >= 0 else "grey"
+        uv = mesh.uv[used] if isinstance(mesh, TexturedMesh) and page >= 0 else None
+        visual = _visual(trimesh, name, page, uv)
+        vertices = _y_up(mesh.vertices[used] - shift)
+        geometry = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
         scene.add_geometry(geometry, node_name=name, geom_name=name, transform=move)
     pages = mesh.pages if isinstance(mesh, TexturedMesh) else []
     data = [_compress(page, quality) for page in pages]
@@ -86,21 +78,18 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
         work.write_bytes(content)
 
 
-def _split_pages(mesh: TexturedMesh | Mesh) -> list[_Part]:
-    """Parts by page, the gray one last."""
+def _split_pages(
+    mesh: TexturedMesh | Mesh,
+) -> list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]:
+    """By texture page, the gray one (-1) last: indices of the vertices, and faces of these."""
     if not len(mesh):
         raise ValueError("a mesh without faces")
-    uv_of_all = mesh.uv if isinstance(mesh, TexturedMesh) else np.zeros((len(mesh.vertices), 2))
     of_face = mesh.page if isinstance(mesh, TexturedMesh) else np.full(len(mesh), -1, np.int32)
     parts = []
     for page in sorted(np.unique(of_face).tolist(), key=lambda number: (number < 0, number)):
         used, faces = np.unique(mesh.faces[of_face == page], return_inverse=True)
-        parts.append(_Part(page, mesh.vertices[used], faces.reshape(-1, 3), uv_of_all[used]))
+        parts.append((page, used, faces.reshape(-1, 3)))
     return parts
-
-
-def _name(page: int) -> str:
-    return f"page{page}" if page >= 0 else "grey"
 
 
 def _y_up(points: Float) -> Float:
@@ -108,31 +97,28 @@ def _y_up(points: Float) -> Float:
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
-def _visual(trimesh: Any, part: _Part) -> Any:
+def _visual(trimesh: Any, name: str, page: int, uv: Float | None) -> Any:
     """Material and uv of a part: a placeholder image that is unique to the page, or gray."""
-    page, is_textured = part.page, part.page >= 0
     linear = ((GRAY[0] / 255.0 + 0.055) / 1.055) ** 2.4  # as color factors of glTF are
+    image = None if uv is None else Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
     material = trimesh.visual.material.PBRMaterial(
-        name=_name(page),
-        baseColorTexture=Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
-        if is_textured
-        else None,
-        baseColorFactor=None if is_textured else [linear, linear, linear, 1.0],
+        name=name,
+        baseColorTexture=image,
+        baseColorFactor=[linear, linear, linear, 1.0] if uv is None else None,
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )
-    uv = np.column_stack([part.uv[:, 0], 1.0 - part.uv[:, 1]])  # trimesh counts from the bottom
-    return trimesh.visual.TextureVisuals(uv=uv if is_textured else None, material=material)
+    if uv is not None:
+        uv = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])  # trimesh counts from the bottom
+    return trimesh.visual.TextureVisuals(uv=uv, material=material)
 
 
 def _compress(page: NDArray[np.uint8], quality: int) -> bytes:
     """A texture page as JPEG of a quality, or as PNG where it is 0."""
     out = io.BytesIO()
-    if quality:
-        # colours at full resolution: charts have sharp edges
-        Image.fromarray(page).save(out, "JPEG", quality=quality, subsampling=0)
-    else:
-        Image.fromarray(page).save(out, "PNG")
+    # colours at full resolution: charts have sharp edges
+    options = {"quality": quality, "subsampling": 0} if quality else {}
+    Image.fromarray(page).save(out, "JPEG" if quality else "PNG", **options)
     return out.getvalue()
 
 

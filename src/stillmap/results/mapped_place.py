@@ -96,9 +96,7 @@ class MappedPlace:
         record, labels = read_run(folder), read_labels(folder)
         opened = ResultFolder(folder, record, source_given=recording is not None)
         poses, changes = _read_poses(opened, labels), list[SessionChange]()
-        noted = record["input"].get("path")
-        read_from = noted if isinstance(noted, str) and noted else None
-        sessions = [_only_session(read_from, labels.stamp_ns, poses)]
+        sessions = [_only_session(record["input"].get("path"), labels.stamp_ns, poses)]
         if has_several:
             sessions = read_sessions(folder)
             changes = read_changes(folder, read_states(folder)[1])
@@ -202,9 +200,9 @@ class MappedPlace:
         return sorted(placed, key=lambda scans: int(scans.start))
 
 
-def _only_session(path: str | None, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
+def _only_session(noted: Any, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
     """The session of a result of one recording, whose frame is the map frame."""
-    D = poses.shape[-1] - 1
+    D, path = poses.shape[-1] - 1, noted if isinstance(noted, str) and noted else None
     times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
     return PlaceSession(
         input_stem(Path(path)) if path else "session",

@@ -10,10 +10,8 @@ from PIL import Image, ImageDraw
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.mapping.beam_statistics import sample_points
-from stillmap.pipeline.quality import Quality
 from stillmap.results.colors import KIND_COLORS
 from stillmap.results.mapped_place import MappedPlace
-from stillmap.results.reader import count_labels
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
 from stillmap.results.timeline import SessionChange
 
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
 
 _BLUE, _ORANGE = "#1f6feb", "#f07800"
 _MAX_POINTS = 50_000  # dynamic returns in a figure
-_SPACE = "\N{NO-BREAK SPACE}"  # between thousands
 _PREVIEW_PIXELS = 420  # longest edge in a notebook
 
 
@@ -97,49 +94,11 @@ def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:
 
 
 def summarize_as_html(result: MappedPlace) -> str:
-    """A small picture of the map and the key facts; needs neither matplotlib nor a network."""
-    rows = "".join(
-        f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
-        f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
-        for name, text in key_facts(result).items()
-    )
-    warnings = "".join(f"<li>{html.escape(one)}</li>" for one in result.warnings)
+    """A small picture of the map and what it is of; needs neither matplotlib nor a network."""
+    lines = [repr(result), *result.warnings]
+    items = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     picture = data_uri(_draw_preview(result))
-    return (
-        "<div style='display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start'>"
-        f"<img alt='map with trajectory' src='{picture}'><div><table>{rows}</table>"
-        + (f"<p>Warnings:</p><ul>{warnings}</ul>" if warnings else "")
-        + "</div></div>"
-    )
-
-
-def key_facts(result: MappedPlace) -> dict[str, str]:
-    """The key figures of a result, by their names."""
-    stamps, grid = result.stamp_ns, result.map
-    height, width = (n * grid.resolution for n in grid.p_occupied.shape)
-    seconds, distance = 0.0, 0.0
-    for scans in result.stretches if len(stamps) else []:
-        span, steps = stamps[scans], np.diff(_track(result)[scans], axis=0)
-        seconds += float(span[-1] - span[0]) * 1e-9
-        distance += float(np.linalg.norm(steps, axis=1).sum())
-    counts = count_labels(result.hit, result.p_static)
-    beams, hits = (f"{counts[name]:,}".replace(",", _SPACE) for name in ("beams", "hits"))
-    return {
-        "scans": f"{len(stamps)} in {seconds:.1f} s",
-        "distance": f"{distance:.1f} m",
-        "beams": f"{beams}, {hits} of them hits",
-        "dynamic": f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of the hits",
-        "moving objects": str(len(result.objects)),
-        "quality": _describe_quality(result.quality),
-        "map": f"{width:.1f} m x {height:.1f} m, cells of {grid.resolution:g} m",
-    }
-
-
-def _describe_quality(quality: Quality) -> str:
-    """Overall, of labels and of geometry, 0 to 100, as far as known."""
-    parts = {name: getattr(quality, name) for name in ("overall", "labels", "geometry")}
-    known = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
-    return f"{', '.join(known)} of 100" if known else "unknown"
+    return f"<img alt='map with trajectory' src='{picture}'><ul>{items}</ul>"
 
 
 def _draw_preview(result: MappedPlace) -> Image.Image:
