@@ -82,6 +82,14 @@ def converted(mapped_street, tmp_path):
     return convert
 
 
+def write(path: Path, block: point_cloud.Block, times: int = 1, progress=None) -> None:
+    """A cloud of so many equal blocks, by the path's ending."""
+    count = times * len(block.points)
+    cloud = point_cloud.Cloud(count, np.zeros(3), None, lambda: iter([block] * times))
+    form = point_cloud_files.format_for(path)
+    point_cloud_files.write(cloud, path, form, progress)
+
+
 def both(result: Path) -> dict[str, np.ndarray]:
     return {part: of_ply(result / f"{part}.ply") for part in ("static", "dynamic")}
 
@@ -156,18 +164,12 @@ def test_tables_are_for_2d_only(mapped_street, tmp_path, capsys):
 )
 def test_memory_is_bounded(form, tmp_path):
     point_cloud_files.require_extras(form, tmp_path)
-    n, blocks = 1 << 14, 40
-
-    def made():
-        for k in range(blocks):
-            points = np.random.default_rng(k).uniform(-50.0, 50.0, (n, 3))
-            yield point_cloud.Block(points, np.full(n, 0.75, np.float32), np.full(n, k, np.int64))
-
-    points = point_cloud.Cloud(n * blocks, np.zeros(3), 0, made)
-    shares = []
+    n, shares = 1 << 14, []
+    xyz = np.random.default_rng(0).uniform(-50.0, 50.0, (n, 3))
+    block = point_cloud.Block(xyz, np.full(n, 0.75, np.float32), np.zeros(n, np.int64))
     tracemalloc.start()
     try:
-        point_cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form, shares.append)
+        write(tmp_path / f"a{form.endings[0]}", block, 40, shares.append)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -180,9 +182,7 @@ def test_memory_is_bounded(form, tmp_path):
 def test_empty_cloud(form, tmp_path):
     empty = point_cloud.Block(np.empty((0, 3)), np.empty(0, np.float32), None)
     path = tmp_path / f"a{form.endings[0]}"
-    point_cloud_files.write(
-        point_cloud.Cloud(0, np.zeros(3), None, lambda: iter([empty])), path, form
-    )
+    write(path, empty)
     if form.name != "e57":  # bounds of nothing are not to be had
         assert len(READERS[form.endings[0]](path)) == 0
     assert path.stat().st_size > 0
@@ -191,12 +191,8 @@ def test_empty_cloud(form, tmp_path):
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57"])
 def test_points_out_of_range_are_refused(name, tmp_path):
     far = np.full((3, 3), 3e5)
-    points = point_cloud.Cloud(
-        3, np.zeros(3), None, lambda: iter([point_cloud.Block(far, np.ones(3, np.float32), None)])
-    )
-    form = point_cloud_files.format_for(tmp_path / name)
     with pytest.raises(InputError, match=f"{name}: cannot be written: a point is beyond"):
-        point_cloud_files.write(points, tmp_path / name, form)
+        write(tmp_path / name, point_cloud.Block(far, np.ones(3, np.float32), None))
     assert not list(tmp_path.iterdir())
 
 
@@ -207,8 +203,6 @@ def test_full_disk(form, tmp_path, limit_files):
     path = tmp_path / f"a{form.endings[0]}"
     limit_files(100_000)
     with pytest.raises(InputError, match=f"{path.name}: cannot be written: "):
-        point_cloud_files.write(
-            point_cloud.Cloud(9 * n, np.zeros(3), None, lambda: iter([block] * 9)), path, form
-        )
+        write(path, block, 9)
     limit_files(None)
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,6 @@ from stillmap.results.eval.labels import (
     assign_equal_width_bins,
     compute_average_precision,
     compute_calibration_error,
-    compute_log_loss,
     score_labels,
 )
 
@@ -32,19 +31,6 @@ def precision_area(score, positive) -> float:
         area += (recall - recall_before) * both / sum(called)
         recall_before = recall
     return area
-
-
-def test_average_precision_by_hand():
-    # scikit-learn's documented example has 0.8333...
-    score, positive = np.array([0.1, 0.4, 0.35, 0.8]), np.array([0, 0, 1, 1], bool)
-    assert compute_average_precision(score, positive) == pytest.approx(1 / 2 + 1 / 2 * 2 / 3)
-
-
-def test_ties_share_a_threshold():
-    # all equal: one threshold, precision = share of positives, whatever the order
-    score = np.full(4, 0.3)
-    for positive in ([1, 0, 0, 0], [0, 0, 0, 1]):
-        assert compute_average_precision(score, np.array(positive, bool)) == 0.25
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.booleans()), min_size=1, max_size=30))
@@ -78,10 +64,6 @@ def test_all_scores_by_hand():
     assert s.ece_unsure == pytest.approx(s.ece)
 
 
-def test_one_half_is_not_called_dynamic():
-    assert scores([0.5, 0.5], [1, 0]).share_called_dynamic == 0.0
-
-
 def test_only_labelled_beams_that_hit_count():
     s = scores([0.9, math.nan, math.nan, 0.9, 0.1], [1, 1, 0, 0, 0], hit=[1, 1, 0, 0, 1])
     assert (s.hits, s.dynamic, s.unlabelled) == (2, 1, 1)
@@ -97,23 +79,16 @@ def test_nothing_dynamic_leaves_ranking_undefined():
     assert plain["unsure"] == 1
     empty = score_labels(np.zeros(0, np.float32), np.zeros(0, bool), np.zeros(0, bool))
     assert empty.to_dict()["log_loss"] is None
+    assert scores([0.0], [1]).log_loss == pytest.approx(-math.log(1e-6))  # as documented
+    assert scores([0.5, 0.5], [1, 0]).share_called_dynamic == 0.0
     json.dumps(empty.to_dict(), allow_nan=False)
-
-
-def test_certain_mistakes_cost_what_is_documented():
-    positive = np.array([True])
-    assert compute_log_loss(np.array([0.0]), positive) == pytest.approx(-math.log(1e-6))
-    assert compute_log_loss(np.array([1.0]), positive) == pytest.approx(0.0, abs=2e-6)
 
 
 def test_calibration_error_of_one_bin():
     p, positive = np.array([0.70, 0.72, 0.71, 0.71]), np.array([1, 0, 0, 1], bool)
     assert compute_calibration_error(p, positive, assign_equal_width_bins(p)) == pytest.approx(0.21)
-
-
-def test_equal_width_bins_have_their_edges():
-    p = np.array([0.0, 0.066, 0.067, 0.999, 1.0])
-    assert assign_equal_width_bins(p).tolist() == [0, 0, 1, 14, 14]
+    edges = np.array([0.0, 0.066, 0.067, 0.999, 1.0])
+    assert assign_equal_width_bins(edges).tolist() == [0, 0, 1, 14, 14]
 
 
 def test_equal_mass_bins_are_filled_alike_and_keep_ties_together():
@@ -135,14 +110,6 @@ def test_calibrated_labels_have_a_small_error_and_shifted_ones_have_not():
     assert scores(p, y).ece_unsure < 0.01
     assert scores(p, y).ece < 0.01
     assert scores(p**2, y).ece_unsure > 0.1
-
-
-def test_order_of_beams_changes_nothing():
-    rng = np.random.default_rng(2)
-    p, y = rng.integers(0, 11, 500) / 10, rng.uniform(size=500) < 0.3
-    order = rng.permutation(500)
-    a, b = scores(p, y).to_dict(), scores(p[order], y[order]).to_dict()
-    assert a == pytest.approx(b)
 
 
 def test_what_is_no_probability_or_fits_nothing_is_refused():

@@ -99,13 +99,6 @@ def test_reference_from_hits_needs_several_and_a_wall():
     np.testing.assert_allclose(centres, [[1.05, 0.05]], atol=1e-12)
 
 
-def test_hits_outside_the_map_count_as_walls_that_are_not_kept():
-    walls = np.array([[-9.0, 0.05, 3.95, 0.05]])
-    hits = np.array([[-5.05, 0.05]] * 3 + [[1.05, 0.05]] * 3)
-    reference = extract_wall_cells_from_hits(hits, walls, room(), HERE)
-    assert score_map(room(), walls, reference, HERE).walls_kept == 0.5
-
-
 def test_reference_on_another_lattice():
     rng = np.random.default_rng(0)
     along = rng.uniform(0.05, 3.95, 20_000)
