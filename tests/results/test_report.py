@@ -63,10 +63,6 @@ def test_browsers_run_no_script_but_the_own_one(html, page):
     assert handlers == []
 
 
-def test_same_result_gives_the_same_page(result, html):
-    assert render_report(result) == html
-
-
 def test_text_from_files_is_escaped(page):
     text = "".join(page.text)
     for foreign in (
@@ -191,43 +187,28 @@ def test_curve_spans_the_axes_and_has_gaps_where_values_are_not_finite():
     assert len(curve_of([1, 2], [-5e9, -5e9], best=1)["y_ticks"]) > 1
 
 
-def with_likelihoods(result, values):
+def test_report_of_an_incomplete_result(result):
     first = result.iterations[0]
-    records = [
-        dataclasses.replace(first, number=n, bound=value) for n, value in enumerate(values, start=1)
-    ]
-    return dataclasses.replace(result, iterations=records)
-
-
-def test_one_iteration_makes_no_curve(result):
+    bounds = (float("nan"), float("-inf"), -3.0)
+    for changes in (
+        {"iterations": [], "snapshots": [], "warnings": [], "stages": {}, "converged": False},
+        {"stages": {"read": {"seconds": None, "peak_memory_bytes": None}}},
+        {
+            "iterations": [
+                dataclasses.replace(first, number=n, bound=b) for n, b in enumerate(bounds)
+            ]
+        },
+    ):
+        Page(render_report(dataclasses.replace(result, **changes)))
     one = render_report(dataclasses.replace(result, iterations=result.iterations[:1]))
     assert 'class="curve"' not in one
     assert "There was one iteration." in one
-    assert render_report(result).count('class="curve"') == 2
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"iterations": [], "snapshots": [], "warnings": [], "stages": {}, "converged": False},
-        {"stages": {"read": {"seconds": None, "peak_memory_bytes": None}}},
-    ],
-)
-def test_report_of_an_incomplete_result(result, change):
-    Page(render_report(dataclasses.replace(result, **change)))
-
-
-def test_maps_without_known_cells_and_without_cells(result):
     for p in (np.full((5, 5), np.nan, np.float32), np.zeros((0, 0), np.float32)):
         empty = dataclasses.replace(
             result.map, p_occupied=p, origin=(0.0, 0.0, 0.0), resolution=1.0
         )
         none = dataclasses.replace(result.evidence, thinly_observed=np.zeros(p.shape, bool))
         Page(render_report(dataclasses.replace(result, map=empty, raw_map=empty, evidence=none)))
-
-
-def test_likelihoods_that_are_not_finite(result):
-    Page(render_report(with_likelihoods(result, [float("nan"), float("-inf"), -3.0])))
 
 
 def test_calibration(result):

@@ -42,11 +42,17 @@ def test_squares_of_cells(factor):
         assert count[i, j] == (square > 0.5).sum()
 
 
-def test_map_colours(result):
+def test_map_and_layers_have_a_pixel_for_a_cell(result):
     p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
     pixels = np.asarray(draw_map(small_map(result, p), (0, 0, 3, 2)).convert("RGB"))
     white, black = (255, 255, 255), (0, 0, 0)
     np.testing.assert_array_equal(pixels, [[UNKNOWN, white, white], [white, black, UNKNOWN]])
+    points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
+    dots = np.asarray(draw_points(points, MapView((0, 0, 3, 2), (3, 2))))
+    np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
+    thin = np.array([[0, 1, 0], [0, 0, 1]], bool)
+    layer = np.asarray(draw_thinly_observed(small_map(result, p), thin, (-1, 0, 3, 2)))
+    np.testing.assert_array_equal(layer, [[0, 0, 0, 1], [0, 0, 1, 0]])
 
 
 def test_window_contains_every_occupied_cell_of_both_maps(result):
@@ -61,19 +67,6 @@ def test_window_contains_every_occupied_cell_of_both_maps(result):
     assert map_window([small_map(result, p)]) == (0.0, 0.0, 300.0, 100.0)
     p[5, 6] = 0.1
     assert map_window([small_map(result, p)]) == (2.0, 1.0, 11.0, 10.0)
-
-
-def test_points_are_drawn_at_their_positions():
-    points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
-    dots = np.asarray(draw_points(points, MapView((0, 0, 3, 2), (3, 2))))
-    np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
-
-
-def test_layer_covers_thinly_observed_cells(result):
-    p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
-    thin = np.array([[0, 1, 0], [0, 0, 1]], bool)
-    layer = np.asarray(draw_thinly_observed(small_map(result, p), thin, (-1, 0, 3, 2)))
-    np.testing.assert_array_equal(layer, [[0, 0, 0, 1], [0, 0, 1, 0]])
 
 
 def test_layer_of_thinly_observed_cells_is_reduced_as_the_map_is(result):

@@ -104,8 +104,5 @@ def test_files_that_hold_no_trajectory(tmp_path):
         read_tum(tmp_path / "binary.tum")
     with pytest.raises(InputError, match="cannot be read"):
         read_tum(tmp_path / "absent.tum")
-
-
-def test_stamps_and_poses_must_match(tmp_path):
     with pytest.raises(ValueError, match=r"poses: expected [0-9]+, got 2"):
         write_tum(tmp_path / "t.tum", STAMPS, POSES[:2])

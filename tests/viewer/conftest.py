@@ -102,7 +102,7 @@ def opened():
 def window(result_of, beams_of, opened):
     """One of a 3D result with surface and models."""
     out = result_of(3, with_models=True)
-    return opened(read_scene(out, "walk.bag"), beams_of(out))
+    return opened(read_scene(out, "walk<b>.bag"), beams_of(out))
 
 
 def _written(out, recording, poses, p_static, log):

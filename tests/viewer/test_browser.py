@@ -1,25 +1,21 @@
 """The page in a headless Chromium."""
 
 import re
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from stillmap.mesh.texture import TexturedMesh
-from stillmap.results.colors import BACKGROUND, KIND_COLORS, TEAL
+from stillmap.results.colors import BACKGROUND, TEAL
 from stillmap.results.gltf import write_glb
 from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 pytest.importorskip("websockets.sync.client")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 
 from browser_tab import BROWSER, HEIGHT, Tab
-from small_place import make_place
 
 from stillmap.results.viewer.window import Window
 
@@ -235,47 +231,3 @@ def test_distance_between_two_clicks(shown, tab):
     assert float(length) == pytest.approx(3.0, abs=0.05)  # pixels are whole
     tab.press("Escape", "Escape")
     until(window, lambda: f"{length} m\n" not in tab.value("document.body.innerText"))
-
-
-def test_click_on_an_object_shows_its_facts(shown, tab):
-    window = shown(3)
-    for _ in range(2):
-        tab.press("ArrowRight", "ArrowRight")
-    until(window, lambda: field_of(tab) == 2)
-    tab.press("3", "Digit3")
-    time.sleep(0.5)  # the page moves the box
-    tab.click(*pixel_of(tab, window, np.array([1.0, 0.0, 0.9])))
-    until(window, lambda: "Object 7" in tab.value("document.body.innerText"))
-    text = tab.value("document.body.innerText")
-    for fact in ("0.5 s to 1.5 s", "1,234", "0.988", "0.80 x 0.40 x 1.80 m", "1.0 m/s"):
-        assert fact in text
-
-
-@pytest.fixture
-def place_shown(tmp_path, opened, tab):
-    """A page of a place that shows the scene."""
-    window = opened(read_scene(make_place(tmp_path / "place")), None)
-    shown_in(tab, window, hues, ("blue", "dark"))
-    tab.value("document.querySelector('.mantine-Notification-closeButton')?.click()")
-    until(window, lambda: "Legend" in tab.value("document.body.innerText"))
-    return window
-
-
-def colored(tab, color):
-    """Pixels of the scene in a color."""
-    return int((np.abs(tab.picture()[:, 250:650] - color).max(axis=2) < 25).sum())
-
-
-def test_keys_step_through_the_sessions_of_a_place(place_shown, tab):
-    window, body = place_shown, "document.body.innerText"
-    assert "session 4 of 4: thursday" in tab.value(body)
-    until(window, lambda: colored(tab, KIND_COLORS["gone"]) > 50)
-    tab.press("PageUp", "PageUp")
-    until(window, lambda: "session 3 of 4: wednesday, 2026-05-30" in tab.value(body))
-    tab.press("PageUp", "PageUp")
-    until(window, lambda: "session 2 of 4: tuesday" in tab.value(body))
-    until(window, lambda: colored(tab, KIND_COLORS["appeared"]) > 50)
-    until(window, lambda: colored(tab, KIND_COLORS["gone"]) < 5)
-    tab.press("c", "KeyC")
-    until(window, lambda: "A: appeared" not in tab.value(body))
-    assert tab.of("Runtime.exceptionThrown") == []

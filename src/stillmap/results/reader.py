@@ -167,10 +167,7 @@ def read_grid(result: Path) -> Grid:
         InputError: it is missing or damaged.
     """
     path = _find_map(result) / "map.npz"
-    p_occupied, origin, resolution = _read_layer(path, "p_occupied")
-    if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
-        what = f"p_occupied is {p_occupied.shape} {p_occupied.dtype}"
-        raise InputError(what, where=str(path), hint="scores are for maps in the plane")
+    p_occupied, origin, resolution = _read_layer(path, "p_occupied", "f")
     if not _is_within(p_occupied, 1.0):
         raise InputError("p_occupied is no probability", where=str(path))
     return Grid(p_occupied.astype(np.float32, copy=False), origin, resolution)
@@ -183,12 +180,9 @@ def read_hit_sums(result: Path, shape: tuple[int, ...]) -> NDArray[np.floating[A
         InputError: it is missing or damaged, or of another shape.
     """
     path = _find_map(result) / "map.npz"
-    alpha: NDArray[np.floating[Any]] = _read_layer(path, "alpha")[0]
-    if alpha.shape != shape or alpha.dtype.kind != "f":
-        what = f"alpha is {alpha.shape} {alpha.dtype}, p_occupied {shape}"
-        raise InputError(what, where=str(path))
-    if not _is_within(alpha, _MAX_HITS):
-        raise InputError("alpha is no sum of hits", where=str(path))
+    alpha: NDArray[np.floating[Any]] = _read_layer(path, "alpha", "f")[0]
+    if alpha.shape != shape or not _is_within(alpha, _MAX_HITS):
+        raise InputError("alpha is no sum of hits for each cell", where=str(path))
     return alpha
 
 
@@ -224,11 +218,7 @@ def read_crossings(result: Path) -> Crossings:
     if not path.exists():
         hint = "`stillmap map` writes it with objects.enabled=true"
         raise InputError("does not exist: no crossings were counted", where=str(path), hint=hint)
-    crossings = Crossings(*_read_layer(path, "crossings"))
-    number = crossings.number
-    if number.ndim != 2 or number.dtype.kind not in "iu":
-        raise InputError(f"crossings is {number.shape} {number.dtype}", where=str(path))
-    return crossings
+    return Crossings(*_read_layer(path, "crossings", "iu"))
 
 
 def _find_map(result: Path) -> Path:
@@ -238,9 +228,13 @@ def _find_map(result: Path) -> Path:
     return home.parent if is_session else result
 
 
-def _read_layer(path: Path, name: str) -> tuple[NDArray[Any], Origin, float]:
-    """A layer of a map, the origin (x, y, yaw) of its lower-left corner, and its resolution."""
+def _read_layer(path: Path, name: str, kinds: str) -> tuple[NDArray[Any], Origin, float]:
+    """A layer (H, W) of one of these kinds of types, the origin (x, y, yaw) of its lower-left
+    corner, and its resolution."""
     layer, origin, edge = read_npz(path, (name, "origin", "resolution"), _MAX_MAP).values()
+    if layer.ndim != 2 or layer.dtype.kind not in kinds:
+        hint = "maps are in the plane"
+        raise InputError(f"{name} is {layer.shape} {layer.dtype}", where=str(path), hint=hint)
     try:
         x, y, yaw = (float(value) for value in origin)
         resolution = float(edge)

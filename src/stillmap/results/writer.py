@@ -71,15 +71,16 @@ def save(
             write_g2o(folder / "graph.g2o", result.graph, result.poses)
         is_3d = result.recording.dimension == 3
         write_labels(folder / "beams", result.recording, result.p_static, colors if is_3d else None)
-        if is_3d:
-            seen = limit_hits(result.deskewed, result.poses, region)
-            write_clouds(folder, seen, result.poses, result.p_static, colors, result.frame.origin)
+        for one in (result if is_3d else None, tilting):
+            if one is not None:
+                seen = limit_hits(one.deskewed, one.poses, region)
+                write_clouds(folder, seen, one.poses, one.p_static, colors, result.frame.origin)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
         more = {}
         if tilting is not None:
-            _write_tilting(folder, tilting, colors, region, result.frame.origin)
+            _write_tilting(folder / TILTING, tilting, colors, region)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
             from stillmap.results.models import write_models
@@ -125,22 +126,14 @@ def write_labels(
 
 
 def _write_tilting(
-    folder: Path,
-    tilting: "TiltingResult",
-    colors: NDArray[np.uint8] | None,
-    region: Region | None,
-    origin: NDArray[np.float64],
+    folder: Path, tilting: "TiltingResult", colors: NDArray[np.uint8] | None, region: Region | None
 ) -> None:
-    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and objects in 3D."""
-    seen = limit_hits(tilting.deskewed, tilting.poses, region)
-    write_clouds(folder, seen, tilting.poses, tilting.p_static, colors, origin)
+    """Write labels, poses and objects in 3D into a new folder."""
+    folder.mkdir()
+    write_labels(folder / "beams", tilting.recording, tilting.p_static, colors)
+    write_tum(folder / "trajectory.tum", tilting.recording.stamp_ns, tilting.poses)
     objects = [one for one in tilting.objects if passes(one, region)]
-    tilting = replace(tilting, objects=objects)
-    inside = folder / TILTING
-    inside.mkdir()
-    write_labels(inside / "beams", tilting.recording, tilting.p_static, colors)
-    write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, tilting.poses)
-    write_objects(inside / "objects", tilting)
+    write_objects(folder / "objects", replace(tilting, objects=objects))
 
 
 def require_overlap(occupancy: GridMap, region: Region | None) -> None:

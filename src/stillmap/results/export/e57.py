@@ -33,7 +33,9 @@ def require_name(path: Path) -> None:
         raise InputError("has a name that libe57 cannot open", where=str(path))
 
 
-def write(cloud: Cloud, path: Path, progress: Callable[[float], None] | None) -> None:
+def write(
+    cloud: Cloud, path: Path, _compressed: bool, progress: Callable[[float], None] | None
+) -> None:
     """Write `cartesianX`, `Y`, `Z`, `intensity` and, with colors, `colorRed`, `Green`, `Blue`.
 
     Coordinates are rounded to 0.1 mm; colors are 0 to 255.

@@ -172,13 +172,9 @@ def _las_points(laspy: Any, header: Any, block: Block) -> Any:
     return out
 
 
-def _write_e57(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    e57.write(cloud, path, progress)
-
-
 FORMATS = (
     Format("las", "a LAS file", (".las", ".laz"), ("laspy",), _write_las),
-    Format("e57", "an E57 file", (".e57",), ("pye57.libe57",), _write_e57),
+    Format("e57", "an E57 file", (".e57",), ("pye57.libe57",), e57.write),
     Format("pcd", "a PCD file", (".pcd",), (), _write_pcd),
     Format("ply", "a PLY file", (".ply",), (), _write_ply),
     Format("xyz", "lines of text", (".xyz",), (), _write_text),
