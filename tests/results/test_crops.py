@@ -68,27 +68,21 @@ def test_cut_beyond_the_map_is_unknown(grid):
     expected[:2, 2:] = grid.p_occupied[58:60, :2]
     np.testing.assert_array_equal(cells, expected)
     assert np.isnan(cut(grid, (100.0, 100.0, 102.0, 103.0))[0]).all()
+    with pytest.raises(InputError, match="turned"):
+        cut(dataclasses.replace(grid, origin=(0.0, 0.0, 0.1)), (0, 0, 1, 1))
 
 
-def test_snapshot_keeps_only_its_part(grid):
+def test_snapshot_keeps_its_part_of_map_and_points(grid, monkeypatch):
     points = np.array([[0.0, 10.0], [5.0, 5.0], [np.nan, 1.0], [3.0, 10.0], [0.0, 12.0]])
     one = snapshot(2, grid, points, (-1.0, 9.0, 3.0, 12.0))
     assert (one.number, one.resolution, one.p_occupied.shape) == (2, 0.5, (6, 8))
     assert one.p_occupied.base is None  # no view that would keep the whole map alive
     assert one.dynamic_points.dtype == np.float32
     np.testing.assert_array_equal(one.dynamic_points, [[0, 10]])
-
-
-def test_snapshot_thins_points(grid, monkeypatch):
     monkeypatch.setattr(snapshots, "_MOST_POINTS", 7)
-    points = np.stack([np.linspace(0, 1, 100, endpoint=False), np.full(100, 10.0)], 1)
-    one = snapshot(1, grid, points, (0.0, 9.0, 1.0, 12.0))
-    np.testing.assert_allclose(one.dynamic_points[:, 0], [i * 100 // 7 / 100 for i in range(7)])
-
-
-def test_a_turned_map_is_refused(grid):
-    with pytest.raises(InputError, match="turned"):
-        cut(dataclasses.replace(grid, origin=(0.0, 0.0, 0.1)), (0, 0, 1, 1))
+    many = np.stack([np.linspace(0, 1, 100, endpoint=False), np.full(100, 10.0)], 1)
+    thinned = snapshot(1, grid, many, (0.0, 9.0, 1.0, 12.0)).dynamic_points[:, 0]
+    np.testing.assert_allclose(thinned, [i * 100 // 7 / 100 for i in range(7)])
 
 
 def test_points_far_apart_take_little_memory():

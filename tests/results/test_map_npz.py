@@ -11,31 +11,25 @@ from stillmap.results.map_server import write_map_npz
 
 def test_content(tmp_path, result):
     write_map_npz(tmp_path / "map.npz", result.map)
+    floats = {name: getattr(result.map, name) for name in ("p_occupied", "alpha", "beta")}
     with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-        assert set(read) == {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
-        np.testing.assert_array_equal(read["p_occupied"], result.map.p_occupied)
-        assert read["p_occupied"].dtype == np.float32
-        assert np.isnan(read["p_occupied"]).any()
-        for name in ("alpha", "beta"):
-            sums = np.asarray(getattr(result.map, name), np.float32)
-            np.testing.assert_array_equal(read[name], sums)
+        assert set(read) == {*floats, "changed", "origin", "resolution"}
+        for name, layer in floats.items():
+            np.testing.assert_array_equal(read[name], np.asarray(layer, np.float32))
             assert read[name].dtype == np.float32
+        assert np.isnan(read["p_occupied"]).any()
         np.testing.assert_array_equal(read["origin"], result.map.origin)
         assert float(read["resolution"]) == result.map.resolution
-
-
-def test_the_looks_that_it_rests_on(tmp_path, result):
-    write_map_npz(tmp_path / "map.npz", result.map, (), result.evidence)
+    evidence = result.evidence
+    counts = {"looks": evidence.observations, "clear_looks": evidence.unobstructed}
+    write_map_npz(tmp_path / "map.npz", result.map, (), evidence)
     with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-        more = {"looks": np.uint16, "clear_looks": np.uint16, "thin": np.bool_}
-        plain = {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
-        assert set(read) == plain | set(more)
-        for name, dtype in more.items():
-            assert read[name].dtype == dtype
-            assert read[name].shape == result.map.p_occupied.shape
-        np.testing.assert_array_equal(read["looks"], result.evidence.observations)
-        np.testing.assert_array_equal(read["clear_looks"], result.evidence.unobstructed)
-        np.testing.assert_array_equal(read["thin"], result.evidence.thinly_observed)
+        assert set(read) == {*floats, *counts, "thin", "changed", "origin", "resolution"}
+        for name, layer in counts.items():
+            np.testing.assert_array_equal(read[name], layer)
+            assert read[name].dtype == np.uint16
+        np.testing.assert_array_equal(read["thin"], evidence.thinly_observed)
+        assert read["thin"].dtype == np.bool_
 
 
 def test_equal_maps_give_equal_bytes_whatever_their_layout(tmp_path, result):

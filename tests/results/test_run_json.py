@@ -59,14 +59,6 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
     assert run["learned"] == result.learned
 
 
-def test_areas(tmp_path, result):
-    area = written(tmp_path, result)["area"]
-    known = np.count_nonzero(~np.isnan(result.map.p_occupied))
-    assert area["known"] == round(0.01 * known, 6)
-    assert area["thin"] == round(0.01 * np.count_nonzero(result.evidence.thinly_observed), 6)
-    assert 0 < area["thin"] < area["known"]
-
-
 def test_iterations(tmp_path, result):
     iterations = written(tmp_path, result)["iterations"]
     assert iterations[1] == {
@@ -96,8 +88,9 @@ def test_calibration(tmp_path, result):
     }
 
 
-def test_doubts(tmp_path, result):
-    assert written(tmp_path, result)["doubts"] == {
+def test_doubts_loops_counts_and_areas(tmp_path, result):
+    run = written(tmp_path, result)
+    assert run["doubts"] == {
         "odometry_disagrees": [7, 9],
         "found_by_wider_search": [7],
         "carried_before": [20],
@@ -105,27 +98,13 @@ def test_doubts(tmp_path, result):
         "ambiguous": [31],
         "length_unknown": [{"first": 12, "last": 19, "metres": 3.25, "std": 0.4}],
     }
-
-
-def test_loops(tmp_path, result):
-    loops = written(tmp_path, result)["loops"]
-    assert loops["accepted"] == [{"earlier": 2, "later": 40, "explained": 0.75}]
-    assert [one["why"] for one in loops["refused"]] == [
-        "explains too little",
-        "other loops disagree",
-        "explains too little",
-    ]
-    assert loops["refused"][1] == {
-        "earlier": 5,
-        "later": 44,
-        "explained": 0.9,
-        "why": "other loops disagree",
-    }
-
-
-def test_counts(tmp_path, result):
+    accepted, refused = run["loops"]["accepted"], run["loops"]["refused"]
+    assert accepted == [{"earlier": 2, "later": 40, "explained": 0.75}]
+    why = ["explains too little", "other loops disagree", "explains too little"]
+    assert [one["why"] for one in refused] == why
+    assert refused[1] == {"earlier": 5, "later": 44, "explained": 0.9, "why": why[1]}
     hit, points = result.recording.hit, result.recording.points
-    assert written(tmp_path, result)["counts"] == {
+    assert run["counts"] == {
         "scans": 60,
         "beams": 60 * 181,
         "hits": int(hit.sum()),
@@ -133,6 +112,10 @@ def test_counts(tmp_path, result):
         "unusable": 3,
         "skipped": 41,
     }
+    known = np.count_nonzero(~np.isnan(result.map.p_occupied))
+    thin = np.count_nonzero(result.evidence.thinly_observed)
+    assert 0 < thin < known
+    assert run["area"] == {"known": round(0.01 * known, 6), "thin": round(0.01 * thin, 6)}
 
 
 def test_values_of_every_kind_become_json(tmp_path, result):
