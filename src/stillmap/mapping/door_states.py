@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -40,7 +39,7 @@ def observe_states(
         poses: (T, 3, 3) T_map_base.
         resolution: m, edge of a cell.
     """
-    masks = [_LeafMask.of_door(door) for door in doors]
+    masks = [_LeafMask(door) for door in doors]
     seen: list[list[Int64]] = [[np.empty((0, 2), np.int64)] for _ in doors]
     for block in iter_blocks(recording.hit) if doors else ():
         beam = block.start + np.flatnonzero(recording.hit[block])
@@ -94,24 +93,18 @@ def _list_looks(stamp_ns: Int64, scan: Int64, cell: Int64, least: float) -> Int6
     return np.array(looks, np.int64).reshape(-1, 2)
 
 
-class _LeafMask(NamedTuple):
+class _LeafMask:
     """Numbers of the cells of both positions in a box from `low` on; -1: none.
 
     Those of the shut leaf come first, `n_shut` of them, then `n_open`.
     """
 
-    low: Cells
-    number: Int64
-    n_shut: int
-    n_open: int
-
-    @classmethod
-    def of_door(cls, door: Door) -> "_LeafMask":
+    def __init__(self, door: Door) -> None:
         cells = np.concatenate([door.shut_cells, door.open_cells])
-        low = cells.min(axis=0)
-        number = np.full(cells.max(axis=0) - low + 1, -1, np.int64)
-        number[tuple((cells - low).T)] = np.arange(len(cells))
-        return cls(low, number, len(door.shut_cells), len(door.open_cells))
+        self.low = cells.min(axis=0)
+        self.number = np.full(cells.max(axis=0) - self.low + 1, -1, np.int64)
+        self.number[tuple((cells - self.low).T)] = np.arange(len(cells))
+        self.n_shut, self.n_open = len(door.shut_cells), len(door.open_cells)
 
     def find(self, cells: Cells) -> Int64:
         """(N,) the numbers of cells (N, 2)."""

@@ -62,20 +62,16 @@ def find_doorways(surface: Cells, resolution: float) -> list[Doorway]:
     return out
 
 
-class _Runs(NamedTuple):
-    """Rows of adjacent cells along a direction, (R,) each, in the order of rows and along them."""
+class _Runs:
+    """Rows of adjacent cells along a direction, (R,) each, in the order of rows and along them.
 
-    row: Index
-    begin: Index
-    end: Index
+    Args:
+        cells: (K, 2).
+        u: unit direction.
+        aside: rows to either side whose cells count as well.
+    """
 
-    @property
-    def length(self) -> Index:
-        return self.end - self.begin + 1
-
-    @classmethod
-    def of_cells(cls, cells: Cells, u: Float, aside: int) -> "_Runs":
-        """Of cells (K, 2) along the unit direction u, with those up to `aside` rows beside it."""
+    def __init__(self, cells: Cells, u: Float, aside: int) -> None:
         along = np.round(cells @ u).astype(np.int64)
         across = np.round(cells @ np.array([-u[1], u[0]])).astype(np.int64)
         low, stride = along.min(), int(np.ptp(along)) + _MAX_HOLE + 2  # rows do not touch
@@ -83,8 +79,10 @@ class _Runs(NamedTuple):
         key = np.unique(rows * stride + (along - low)[:, None])
         first = np.flatnonzero(np.diff(key, prepend=key[0] - stride) > _MAX_HOLE + 1)
         last = np.append(first[1:], len(key)) - 1
-        row = key[first] // stride
-        return cls(row, key[first] - row * stride + low, key[last] - row * stride + low)
+        self.row = key[first] // stride
+        self.begin = key[first] - self.row * stride + low
+        self.end = key[last] - self.row * stride + low
+        self.length = self.end - self.begin + 1
 
 
 def _find_directions(cells: Cells, resolution: float) -> Float:
@@ -111,7 +109,7 @@ def _count_in_rows(across: Index) -> Index:
 
 def _find_gaps(cells: Cells, u: Float, resolution: float) -> tuple[Float, Index]:
     """Ends (G, 2, 2) of the gaps along a direction, and the lengths (G,) of the shorter walls."""
-    runs = _Runs.of_cells(cells, u, 1)
+    runs = _Runs(cells, u, 1)
     gap = runs.begin[1:] - runs.end[:-1]
     posts = np.sort(np.column_stack([runs.length[:-1], runs.length[1:]]), axis=1)
     low, high = (metres / resolution for metres in _WIDTH)
@@ -162,7 +160,7 @@ def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
     """
     middle, reach = doorway.ends.mean(axis=0), doorway.width + 14.0
     near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
-    field = SurfaceField.of_cells(near, middle, reach)
+    field = SurfaceField(near, middle, reach)
     best: tuple[float, LoneLeaf | None] = 0.0, None
     u = (doorway.ends[1] - doorway.ends[0]) / doorway.width
     for v in (np.array([-u[1], u[0]]), np.array([u[1], -u[0]])):

@@ -54,7 +54,7 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
     middle = doorway.ends.mean(axis=0)
     reach = 2.0 * doorway.width + 12.0
     near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
-    field = SurfaceField.of_cells(near, middle, reach)
+    field = SurfaceField(near, middle, reach)
     best: tuple[float, LoneLeaf | None] = 0.0, None
     for end, side in itertools.product((0, 1), (-1.0, 1.0)):
         rated = _rate_leaves(field, doorway, end, side)

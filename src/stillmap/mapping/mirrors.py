@@ -21,7 +21,7 @@ _MAX_BINS = 1 << 17  # of the distances of lines, 6 km; of places farther apart 
 _MIN_LINE, _MIN_LINE_CELLS = 1.0, 5  # m and cells of wall on a line, such as frames of mirrors
 
 
-class SurfaceCells(NamedTuple):
+class SurfaceCells:
     """Cells with a surface.
 
     Attributes:
@@ -31,21 +31,16 @@ class SurfaceCells(NamedTuple):
         resolution: m.
     """
 
-    cells: Cells
-    keys: Cells
-    own_keys: Cells
-    resolution: float
-
-    @classmethod
-    def of(cls, points: Float, is_static: Bool, resolution: float) -> "SurfaceCells":
+    def __init__(self, points: Float, is_static: Bool, resolution: float) -> None:
         """The cells in which several of the points (N, 2) lie, fewer if they are static (N,)."""
         keys = cell_keys(np.floor(points / resolution).astype(np.int64))
         weight = np.where(is_static, 1.0 / _MIN_HITS, 1.0 / _MIN_DYNAMIC_HITS)
         own, number = np.unique(keys, return_inverse=True)
         own = own[np.bincount(number, weights=weight, minlength=len(own)) > 1.0 - 1e-9]
-        cells = np.stack([own >> 32, (own & 0xFFFFFFFF) - (1 << 31)], axis=-1)
-        around = [cells + np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        return cls(cells, np.unique(cell_keys(np.concatenate(around))), own, resolution)
+        self.cells = np.stack([own >> 32, (own & 0xFFFFFFFF) - (1 << 31)], axis=-1)
+        around = [self.cells + np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        self.keys = np.unique(cell_keys(np.concatenate(around)))
+        self.own_keys, self.resolution = own, resolution
 
     def are_near(self, points: Float) -> Bool:
         """(...) whether there is a surface in the cells of points (..., 2) or around them."""

@@ -73,7 +73,7 @@ def find_mirrors(
         resolution: edge of a cell, metres.
     """
     beams = _sample_beams(recording, poses, p_static)
-    surfaces = SurfaceCells.of(beams.ends, beams.is_static, resolution)
+    surfaces = SurfaceCells(beams.ends, beams.is_static, resolution)
     mirrors: list[Mirror] = []
     for normal, distance in iter_lines(surfaces.cells, resolution):
         for side in (1.0, -1.0):

@@ -50,7 +50,7 @@ def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cell
         return none
     reach = 1.5 * line.length + 10.0
     surface = surface[(np.abs(surface - line.middle) < reach).all(axis=1)]
-    field = SurfaceField.of_cells(surface, line.middle, reach)
+    field = SurfaceField(surface, line.middle, reach)
     best: tuple[float, Cells] = 0.0, none
     most = round(_MAX_HIDDEN / resolution)
     for end, at_hinge in itertools.product((-1.0, 1.0), range(most + 1)):
@@ -81,25 +81,18 @@ def fit_line(cells: Cells, resolution: float) -> Line | None:
     return Line(middle + 0.5 * (at.max() + at.min()) * along, along, length)
 
 
-class SurfaceField(NamedTuple):
+class SurfaceField:
     """Which cells are surface, and which have some within a cell, in a box from `low` on."""
 
-    low: Cells
-    is_surface: Bool
-    is_near: Bool
-
-    @classmethod
-    def of_cells(cls, cells: Cells, middle: Float, reach: float) -> "SurfaceField":
-        low = np.floor(middle - reach).astype(np.int64) - 2
+    def __init__(self, cells: Cells, middle: Float, reach: float) -> None:
         size = 2 * math.ceil(reach) + 6
-        is_surface = np.zeros((size, size), bool)
-        is_surface[tuple((cells - low).T)] = True
-        padded = np.pad(is_surface, 1)
-        is_near = np.zeros_like(is_surface)
+        self.low = np.floor(middle - reach).astype(np.int64) - 2
+        self.is_surface, self.is_near = np.zeros((2, size, size), bool)
+        self.is_surface[tuple((cells - self.low).T)] = True
+        padded = np.pad(self.is_surface, 1)
         for i in range(3):
             for j in range(3):
-                is_near |= padded[i : i + size, j : j + size]
-        return cls(low, is_surface, is_near)
+                self.is_near |= padded[i : i + size, j : j + size]
 
     def sample(self, layer: Bool, points: NDArray[Any]) -> Bool:
         """(...,) of a layer at points (..., 2) in cells; outside False."""

@@ -222,7 +222,7 @@ def reject_inconsistent(
 
     At least `_MIN_AGREEING` closures nearby and half of them all must agree.
     """
-    accepted = _AcceptedLoops.collect(context, chain, closures)
+    accepted = _AcceptedLoops(context, chain, closures)
     at, nearby = context.travelled[accepted.scans], _NEARBY * context.keyframe_distance
     out, n = [], 0
     for closure in closures:
@@ -261,7 +261,6 @@ def reject_inconsistent_since(
     return decided[:changed] + again[changed - relevant :]
 
 
-@dataclass(frozen=True, eq=False)
 class _AcceptedLoops:
     """Loop closures that are not rejected, as arrays.
 
@@ -274,27 +273,17 @@ class _AcceptedLoops:
             map's axes.
     """
 
-    scans: Index
-    T: Float
-    P_earlier: Float
-    P_later: Float
-    covariance: Float
-    accumulated: Float
-
-    @classmethod
-    def collect(
-        cls, context: LoopContext, chain: list[Constraint], closures: list[LoopClosure]
-    ) -> "_AcceptedLoops":
+    def __init__(
+        self, context: LoopContext, chain: list[Constraint], closures: list[LoopClosure]
+    ) -> None:
         accepted = [closure for closure in closures if not closure.rejected]
         scans = np.array([[c.earlier, c.later] for c in accepted], np.intp).reshape(-1, 2)
-        T, covariance = (
-            np.array(of_each).reshape(-1, 3, 3)
-            for of_each in ([c.T for c in accepted], [c.covariance for c in accepted])
-        )
+        self.scans = scans
+        self.T = np.array([c.T for c in accepted]).reshape(-1, 3, 3)
+        self.covariance = np.array([c.covariance for c in accepted]).reshape(-1, 3, 3)
         at = np.searchsorted(context.keyframes, scans[:, 1])
-        accumulated = _accumulate_covariance(context, chain)[at]
-        P = context.poses[scans]
-        return cls(scans, T, P[:, 0], P[:, 1], covariance, accumulated)
+        self.accumulated = _accumulate_covariance(context, chain)[at]
+        self.P_earlier, self.P_later = context.poses[scans].swapaxes(0, 1)
 
     def agree(self, n: int, others: Index) -> Bool:
         """(K,) whether loop n and others (K,) fit the motion between their later scans."""
