@@ -44,49 +44,45 @@ def known(seen, threads=1):
     return p_occupied, beta, found.learned["no_return_trusted"], m
 
 
-def test_a_lone_beam_without_return_shows_nothing():
-    seen = room_with()
-    p_occupied, beta, _, _ = known(with_lost(seen, np.arange(len(seen.what)) % 181 == 90))
-    assert np.isnan(p_occupied((5.05, 0.05), (20.05, 0.05))).all()
-    assert (beta((5.05, 0.05), (20.05, 0.05)) > 10).all()
-    assert p_occupied((2.05, 0.05)) < 0.1  # its neighbours see these cells too
-    assert p_occupied((4.05, 0.35)) > 0.8
-
-
-def test_neighbouring_beams_show_free_space_in_the_open():
-    # a wall on one side only: all other beams are in the open
-    seen = watch([Wall((0, 1), 3.0)], 20)
-    p_occupied, beta, trust, _ = known(seen)
-    assert trust > 0.9
-    free = p_occupied((2.05, -1.05), (20.05, 0.05), (5.05, -12.05))
-    assert (free < 0.1).all()
-    # the last 0.3 m say nothing
-    assert np.isnan(p_occupied((29.85, 0.05)))
-    assert beta((29.85, 0.05)) > 0
-
-
-def test_neighbouring_beams_show_nothing_behind_a_wall():
-    # a few beams miss their return at the wall, most are in the open
-    seen = watch([Wall((1, 0), 4.0, width=0.6), Wall((0, 1), 3.0)], 40)
-    scan, beam = np.divmod(np.arange(len(seen.what)), 181)
-    p_occupied, beta, trust, _ = known(with_lost(seen, (scan % 20 == 3) & (np.abs(beam - 90) < 4)))
-    assert trust > 0.9
-    assert np.isnan(p_occupied((6.05, 0.05), (20.05, 0.05))).all()
-    assert (beta((6.05, 0.05), (20.05, 0.05)) > 0).all()
-    assert p_occupied((20.05, -5.05)) < 0.1
-
-
-def test_nothing_is_shown_where_walls_swallow_beams():
-    # glass: half of the beams on the wall ahead have no return, as those in the gap beside it
-    seen = watch([Wall((1, 0), 4.0, width=2.0), Wall((0, 1), 3.0), Wall((0, -1), 3.0)], 40)
-    scan, beam = np.divmod(np.arange(len(seen.what)), 181)
-    p_occupied, beta, trust, _ = known(with_lost(seen, (scan % 2 == 0) & (np.abs(beam - 90) < 24)))
-    assert trust < 0.5
-    outside = (6.05, 0.05), (20.05, 0.05), (6.05, 3.35)
-    assert np.isnan(p_occupied(*outside)).all()
-    assert (beta(*outside[:2]) > 0).all()
-    inside = p_occupied((1.05, 0.05), (3.55, 0.05), (2.05, -1.05))
-    assert (inside < 0.1).all()
+@pytest.mark.parametrize(
+    ("things", "is_lost", "is_trusted", "free", "unseen"),
+    [
+        # a lone one shows nothing; its neighbours see the cells before the wall too
+        (ROOM, lambda _, beam: beam == 90, False, [(2.05, 0.05)], [(5.05, 0.05), (20.05, 0.05)]),
+        # in the open neighbouring ones show free space, but for the last 0.3 m
+        (
+            [Wall((0, 1), 3.0)],
+            lambda _, beam: beam < 0,
+            True,
+            [(2.05, -1.05), (20.05, 0.05), (5.05, -12.05)],
+            [(29.85, 0.05)],
+        ),
+        # a few miss their return at a wall, most are in the open
+        (
+            [Wall((1, 0), 4.0, width=0.6), Wall((0, 1), 3.0)],
+            lambda scan, beam: (scan % 20 == 3) & (np.abs(beam - 90) < 4),
+            True,
+            [(20.05, -5.05)],
+            [(6.05, 0.05), (20.05, 0.05)],
+        ),
+        # glass: half of those on the wall ahead have no return, as those in the gap beside it
+        (
+            [Wall((1, 0), 4.0, width=2.0), *ROOM[1:]],
+            lambda scan, beam: (scan % 2 == 0) & (np.abs(beam - 90) < 24),
+            False,
+            [(1.05, 0.05), (3.55, 0.05), (2.05, -1.05)],
+            [(6.05, 0.05), (20.05, 0.05)],
+        ),
+    ],
+)
+def test_beams_without_a_return(things, is_lost, is_trusted, free, unseen):
+    seen = watch(things, 40)
+    lost = is_lost(*np.divmod(np.arange(len(seen.what)), 181))
+    p_occupied, beta, trust, _ = known(with_lost(seen, lost))
+    assert (trust > 0.5) == is_trusted
+    assert (p_occupied(*free) < 0.1).all()
+    assert np.isnan(p_occupied(*unseen)).all()
+    assert (beta(*unseen) > 0).all()
 
 
 @pytest.mark.parametrize(("threads", "beams"), [(1, 1), (3, 500)])
@@ -96,17 +92,6 @@ def test_chunks_and_threads_change_no_bit(monkeypatch, threads, beams):
     once = known(seen)[3].p_occupied
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     np.testing.assert_array_equal(known(seen, threads)[3].p_occupied, once)
-
-
-@pytest.mark.parametrize("estimator", ["paper", "hit-ratio", "tracker"])
-def test_other_estimators_count_every_beam(estimator):
-    seen = room_with()
-    found = seen.e_step(estimator=estimator)
-    assert found.no_return is None
-    grid = _core.OccupancyGrid2D(RESOLUTION)
-    e = found.p_static
-    assert em.add_trusted_beams(grid, seen.recording, seen.poses, e, None) is None
-    np.testing.assert_array_equal(grid.dense()[2], seen.grid(e).dense()[2])
 
 
 def test_scans_without_a_single_return_say_nothing_of_walls():

@@ -117,16 +117,6 @@ def test_floor_under_movers_is_free():
     assert np.isfinite(m.p_occupied[m.alpha + m.beta > 0]).all()
 
 
-def test_without_cell_probabilities_it_is_15():
-    seen = watch([Wall((1, 0), 4.05)], 5)
-    m = em.make_occupancy_map(seen.grid())
-    known = m.alpha + m.beta > 0
-    np.testing.assert_allclose(
-        m.p_occupied[known], m.alpha[known] / (m.alpha + m.beta)[known], 1e-6
-    )
-    assert np.isnan(m.p_occupied[~known]).all()
-
-
 @pytest.mark.parametrize("printed", [False, True])
 def test_windows_and_tiles_equal_the_whole(printed, monkeypatch):
     grid = watch([Wall([1.0, 0.0], 3.0)], 6.0, fan()).grid()

@@ -163,9 +163,7 @@ def test_scans_do_not_touch():
     alone = classify_segments(scans(row))
     for both in (scans(row, row), scans(row, [], row)):
         np.testing.assert_array_equal(classify_segments(both), np.tile(alone, 2))
-
-
-def test_nothing_to_classify():
+    # nothing to classify
     assert classify_segments(scans([])).shape == (0,)
     assert (classify_segments(scans([NO_RETURN] * 9)) == -1).all()
     assert (classify_segments(scans([UNUSABLE] * 9)) == -1).all()

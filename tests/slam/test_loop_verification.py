@@ -97,10 +97,9 @@ def test_comparable_beams_were_observed_from_the_same_side():
     # one beam along x that ends at 5 m: the wall is seen from the left
     grid = _core.OccupancyGrid2D(0.1, 0.5)
     T = np.eye(3)[None]
-    end = np.array([[5.05, 0.05]], np.float32)
-    one = np.array([True]), np.ones(1, np.float32), np.array([0, 1])
-    _core.add_beams(grid, end, one[0], one[1], one[2], T, remove=False)
     ends = np.array([[5.05, 0.05], [5.05, 0.05], [5.05, 3.0]], np.float32)
+    once = np.array([True]), np.ones(1, np.float32), np.array([0, 1])
+    _core.add_beams(grid, ends[:1], *once, T, remove=False)
     weights = np.array([0.5, 0.3, 0.2], np.float32)
     view = make_scan(ends, weights, np.eye(3))
     # from the left, from the right, and where nobody looked

@@ -65,9 +65,8 @@ def test_the_map_frame_is_the_first_base():
     np.testing.assert_array_equal(mapped.covariance[0], np.zeros((3, 3)))
     assert np.sqrt(mapped.covariance[:, 0, 0].max()) < 0.1
     shift = se2.matrix(100.0, -50.0, 2.0)
-    moved = dataclasses.replace(
-        simulation.recording, T_odom_base=shift @ simulation.recording.T_odom_base
-    )
+    odometry = shift @ simulation.recording.T_odom_base
+    moved = dataclasses.replace(simulation.recording, T_odom_base=odometry)
     # rounding may decide between two starts of a search: the same to less than a cell
     np.testing.assert_allclose(build(moved).poses, mapped.poses, atol=0.02)
 
@@ -87,9 +86,8 @@ def test_known_movers_do_not_bias_poses():
     e = np.where(simulation.truth.mover >= 0, 0.0, 1.0).astype(np.float32)
     recording = simulation.recording
     ghosts = recording.points.copy()
-    of_movers = simulation.truth.mover >= 0
-    assert of_movers.sum() > 50
-    ghosts[of_movers] *= np.float32(0.5)  # wherever they are
+    assert (e == 0.0).sum() > 50
+    ghosts[e == 0.0] *= np.float32(0.5)  # wherever they are
     a, b = build(recording, e), build(dataclasses.replace(recording, points=ghosts), e)
     assert ate(a, simulation.truth) < 0.01
     # ghosts still cross cells: they may shift the last digits of a pose, no more
@@ -97,11 +95,7 @@ def test_known_movers_do_not_bias_poses():
     assert distance.max() < 0.01
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "yaw"),
-    [(-0.04, 0.0, np.pi), (0.3, 0.0, 0.0), (0.1, -0.2, -1.2)],
-    ids=["turned round", "ahead", "askew"],
-)
+@pytest.mark.parametrize(("x", "y", "yaw"), [(-0.04, 0, np.pi), (0.3, 0, 0), (0.1, -0.2, -1.2)])
 def test_sensor_extrinsics(x, y, yaw):
     # all round: wherever the sensor looks, it sees the same world
     a, b = small_room(ALL_ROUND | {"x": 0.0}), small_room(ALL_ROUND | {"x": x, "y": y, "yaw": yaw})
@@ -112,8 +106,7 @@ def test_sensor_extrinsics(x, y, yaw):
     assert distance.max() < 0.01
     turn = se2.wrap(se2.parameters(of_a.poses)[:, 2] - se2.parameters(of_b.poses)[:, 2])
     assert np.abs(turn).max() < np.radians(0.3)
-    truth = se2.inverse(b.truth.T_world_base[0]) @ b.truth.T_world_base
-    assert np.linalg.norm(of_b.poses[:, :2, 2] - truth[:, :2, 2], axis=1).max() < 0.01
+    assert ate(of_b, b.truth) < 0.01
 
 
 def test_two_sensors_on_one_robot():

@@ -89,10 +89,8 @@ def test_without_odometry(n, seed):
 
 
 def two_lasers(seed, both):
-    options = {
-        "robot": {"scans": 200 * (1 + both), "speed": 1.0},
-        "laser": {"second_laser": both, "beams": 120},
-    }
+    robot = {"scans": 200 * (1 + both), "speed": 1.0}
+    options = {"robot": robot, "laser": {"second_laser": both, "beams": 120}}
     simulation = simulate(scene_by_name("hall", options), seed)
     return ate(mapped(simulation.recording), simulation.truth)
 

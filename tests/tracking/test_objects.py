@@ -104,14 +104,6 @@ def test_an_edge_that_flickers_is_no_object():
     assert len(track_objects(recording, poses, p, anything)) > 0
 
 
-def test_lengths_that_disagree_are_refused():
-    simulation = room()
-    poses, p = simulation.truth.T_world_base, labels(simulation)
-    for wrong in ((poses[:-1], p), (poses, p[:-1])):
-        with pytest.raises(ValueError, match="poses, p_static: expected"):
-            track_objects(simulation.recording, *wrong, OPTIONS)
-
-
 def test_a_box_by_hand():
     rng = np.random.default_rng(0)
     offset = rng.uniform([-2.0, -0.5], [2.0, 0.5], (4000, 2))
