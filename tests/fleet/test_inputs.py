@@ -7,7 +7,15 @@ import pytest
 from fsspec.implementations.memory import MemoryFile
 
 from stillmap.core.errors import InputError
-from stillmap.fleet.inputs import Entry, absolute, fetch, find_sources, read_manifest, short_name
+from stillmap.fleet.inputs import (
+    Entry,
+    absolute,
+    fetch,
+    find_sources,
+    name_sources,
+    read_manifest,
+    short_name,
+)
 
 FLASER = "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 host 1.0\n"
 
@@ -26,7 +34,7 @@ def entries_of(inputs, place):
 
 
 def names(entries, known=None):
-    return [one.name for one in find_sources(entries, known or {})]
+    return [one.name for one in name_sources(find_sources(entries), known or {})]
 
 
 def test_folder_is_expanded_one_level(logs):
@@ -141,4 +149,4 @@ def test_two_places_for_one_recording(tmp_path):
     text = "input,place\nlogs/a.clf,hall\nlogs,yard\n"
     entries = read_manifest(str(write(tmp_path, "m.csv", text)))
     with pytest.raises(InputError, match=r"m.csv:3: .*a.clf is in two places: hall and yard"):
-        find_sources(entries, {})
+        find_sources(entries)

@@ -6,7 +6,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -238,12 +238,11 @@ def _entry(folder: str, row: Any, where: str) -> Entry:
     return Entry(absolute(source), place, where)
 
 
-def find_sources(entries: Iterable[Entry], names: dict[str, str]) -> list[Source]:
-    """The recordings that entries stand for, in order; each once.
+def find_sources(entries: Iterable[Entry]) -> dict[str, str | None]:
+    """The recordings that entries stand for, in order, each with its place.
 
     Args:
         entries: recordings, folders of recordings, and patterns.
-        names: those of earlier runs by input; they stay, even of recordings not given now.
 
     Raises:
         InputError: a folder or pattern without a recording, storage that cannot be read, or a
@@ -255,6 +254,16 @@ def find_sources(entries: Iterable[Entry], names: dict[str, str]) -> list[Source
             if places.setdefault(source, entry.place) != entry.place:
                 what = f"{source} is in two places: {places[source]} and {entry.place}"
                 raise InputError(what, where=entry.where)
+    return places
+
+
+def name_sources(places: Mapping[str, str | None], names: Mapping[str, str]) -> list[Source]:
+    """Recordings with a name for the result of each.
+
+    Args:
+        places: of the recordings.
+        names: those of earlier runs by input; they stay, even of recordings not given now.
+    """
     taken = {name.casefold() for name in names.values()}
     return [
         Source(source, names.get(source) or make_unique(short_name(source), taken), place)

@@ -21,6 +21,7 @@ from stillmap.fleet.inputs import (
     find_sources,
     is_folder_name,
     is_local,
+    name_sources,
     open_location,
 )
 from stillmap.fleet.tasks import PLACES, RESULTS, STAGING, Outcome, Task, read_made, run_task
@@ -138,8 +139,9 @@ def run_fleet(request: Request) -> Fleet:
     if is_local(request.output):
         root = str(resolve_output(Path(root)))
     _require_fleet(root)
-    sources = find_sources(request.entries, _known_names(root))
+    places_of = find_sources(request.entries)
     with _hold_output(root):
+        sources = name_sources(places_of, _known_names(root))
         with _remove_unfinished(root, request), _open_client(request) as client:
             tasks = [
                 Task("map", source.name, (source.input,), root, request.map_flags)
