@@ -176,7 +176,7 @@ class OdometryFaults:
             ns: stamp of the scan.
             seconds: since the last one.
         """
-        self._increment.value = increment
+        self._increment.value, self._guess, self._ns = increment, guess, ns
         is_slipping = self._slip.is_slipping(self._count, pose, guess)
         if increment is None:
             return guess
@@ -194,27 +194,25 @@ class OdometryFaults:
         grid: _core.OccupancyGrid2D,
         scan: Scan,
         pose: Float,
-        priors: tuple[MotionPrior, MotionPrior],
         match: ScanMatch,
-        ns: int,
         usual: float | None,
         *,
+        is_odometry: bool,
         may_stand: bool,
     ) -> Fault | None:
-        """The fault that a scan shows.
+        """The fault that the scan shows to which the motion was predicted.
 
         Args:
             grid: the local map.
-            scan: the hits of the scan.
+            scan: its hits.
             pose: (3, 3) T_map_base of the scan before.
-            priors: of the scan, and that of constant velocity.
             match: by the prior.
-            ns: stamp of the scan.
             usual: recent average of the explained share; None: whether the robot stands is not
                 tested, for the scans contradict the map.
+            is_odometry: the prior is that of odometry.
             may_stand: if it does, that is believed now: what keeps its place is not people.
         """
-        prior, guess = priors
+        guess = self._guess
         slip = self._slip.detect(self._count, pose, guess, grid, scan, match)
         if slip is not None:
             back = min(self._count - slip.first, len(self._stamps))
@@ -229,11 +227,10 @@ class OdometryFaults:
             by_odometry = motion_model.odometry_prior(pose, increment, self._options)
             self._stands = is_inconsistent(by_odometry, match.T_map_base)
             return None
-        if usual is None or not prior.is_odometry or match.contradicts_odometry:
+        is_tested = is_odometry and not match.contradicts_odometry and len(scan.points) > 0
+        if usual is None or not is_tested:
             return None
-        if not len(scan.points):
-            return None
-        standing = self._standing.observe(grid, scan, pose, match.T_map_base, increment, ns)
+        standing = self._standing.observe(grid, scan, pose, match.T_map_base, increment, self._ns)
         return self._accept_standing(standing, usual) if may_stand else None
 
     def advance(self, ns: int) -> None:

@@ -153,14 +153,14 @@ class ScanOdometry:
         """
         scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams)
         usual = self._usual.get(beams.sensor, 0.0)
-        guess, learned = self._guess(), self._learned_prior(prior, increment)
+        learned = self._learned_prior(prior, increment)
         match, is_slipping = self._match(beams, scan, prior, learned, usual)
         is_carried = self._contradictions >= _CARRIED_AFTER
         if is_carried:
             self._start_anew()
             match, is_slipping = accept_prior(prior), False
         elif not self._is_first:
-            fault = self._detect_fault(beams, scan, (prior, guess), match)
+            fault = self._detect_fault(beams, scan, prior, match)
             if fault is not None:
                 self._pose, match = fault.before, fault.match
                 learned = self._learned_prior(prior, increment)  # the last pose has changed
@@ -279,19 +279,18 @@ class ScanOdometry:
         return accept_prior(prior)
 
     def _detect_fault(
-        self,
-        beams: ScanBeams,
-        scan: Scan,
-        priors: tuple[MotionPrior, MotionPrior],
-        match: ScanMatch,
+        self, beams: ScanBeams, scan: Scan, prior: MotionPrior, match: ScanMatch
     ) -> Fault | None:
         """What is wrong with odometry; scans since then are removed from the local map."""
         has_map = self.local_map.has_sensor(beams.sensor) and not self._contradictions
-        may_be_people = self.crowd.walks_along or self.crowd.may_walk_along
-        usual = self._usual.get(beams.sensor) if has_map else None
-        grid, ns = self.local_map.grid, beams.stamp_ns
         fault = self._faults.detect(
-            grid, scan, self._pose, priors, match, ns, usual, may_stand=not may_be_people
+            self.local_map.grid,
+            scan,
+            self._pose,
+            match,
+            self._usual.get(beams.sensor) if has_map else None,
+            is_odometry=prior.is_odometry,
+            may_stand=not (self.crowd.walks_along or self.crowd.may_walk_along),
         )
         if fault is not None and fault.first_ns is not None:
             self.local_map.remove_since(fault.first_ns)
