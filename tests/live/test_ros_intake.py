@@ -7,8 +7,8 @@ from ros_messages import laser_scan, odometry, point_cloud, transform
 
 from stillmap.core import se2
 from stillmap.live.ros import intake
+from stillmap.live.ros.inputs import Parameters
 from stillmap.live.ros.intake import ScanIntake
-from stillmap.live.ros.parameters import Parameters
 
 Transforms = fake_ros.load("transforms").Transforms
 

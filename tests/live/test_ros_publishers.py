@@ -13,8 +13,7 @@ from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
-from stillmap.live.ros.messages import Mount, to_cloud_beams, to_scan_beams
-from stillmap.live.ros.parameters import Parameters
+from stillmap.live.ros.inputs import Mount, Parameters, to_cloud_beams, to_scan_beams
 from stillmap.live.update import Update
 
 module = fake_ros.load("publishers")

@@ -13,8 +13,7 @@ from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.live.ros.messages import Mount, shape_of, to_cloud_beams, to_scan_beams
-from stillmap.live.ros.parameters import Parameters
+from stillmap.live.ros.inputs import Mount, Parameters, shape_of, to_cloud_beams, to_scan_beams
 from stillmap.live.scan import ScanBeams
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.live.history import FOLDER
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import Show
+from stillmap.live.ros.inputs import Parameters, declare
 from stillmap.live.ros.intake import BACKWARDS, NO_MOUNT, NO_ODOMETRY, Arrival, ScanIntake
-from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import MapPublisher, Publishers
 from stillmap.live.ros.transforms import Transforms
 from stillmap.live.update import DOUBTS

@@ -25,9 +25,14 @@ from stillmap.io.ros.messages import stamp_ns
 from stillmap.io.trajectory import embed_in_3d, quaternion_from_pose
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
+from stillmap.live.ros.inputs import (
+    Parameters,
+    end_points,
+    split_ranges,
+    spread_covariance,
+    to_cells,
+)
 from stillmap.live.ros.intake import Arrival
-from stillmap.live.ros.messages import end_points, split_ranges, spread_covariance, to_cells
-from stillmap.live.ros.parameters import Parameters
 from stillmap.live.update import Update
 from stillmap.pipeline.options import MapMode
 

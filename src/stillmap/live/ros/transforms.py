@@ -15,8 +15,7 @@ from stillmap.core.array_types import Float
 from stillmap.io.ros.messages import frame_name
 from stillmap.io.ros.tf import project_to_plane
 from stillmap.io.trajectory import MAX_TRANSLATION
-from stillmap.live.ros.messages import Mount
-from stillmap.live.ros.parameters import Parameters
+from stillmap.live.ros.inputs import Mount, Parameters
 
 _MESSAGES, _ROBOT = "odometry", "robot"  # frames of Odometry messages in a buffer of their own
 
