@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Index, Int64
 from stillmap.core.arrays import ArrayBuilder, empty, squared_lengths
 from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
@@ -101,13 +102,13 @@ class RecordingBuilder:
 
     def build(
         self,
-        T_base_sensor: NDArray[np.float64],
+        T_base_sensor: Float,
         *,
         source: Source,
-        T_odom_base: NDArray[np.float64] | None = None,
-        T_recorded_base: NDArray[np.float64] | None = None,
-        record: NDArray[np.int64] | None = None,
-        selection: NDArray[np.intp] | None = None,
+        T_odom_base: Float | None = None,
+        T_recorded_base: Float | None = None,
+        record: Int64 | None = None,
+        selection: Index | None = None,
         **more: Any,
     ) -> Recording:
         """Build the recording, ordered by stamps; afterwards nothing can be added.
@@ -145,7 +146,7 @@ class RecordingBuilder:
 
 
 def reorder_scans(
-    values: NDArray[Any], length: NDArray[np.int64], order: NDArray[np.intp], folder: Path | None
+    values: NDArray[Any], length: Int64, order: Index, folder: Path | None
 ) -> NDArray[Any]:
     """Values per beam (M, ...) of scans with these numbers of beams, in another order of scans.
 

@@ -24,6 +24,7 @@ from PIL import Image, UnidentifiedImageError
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.config import STRICT, load_toml, override
 from stillmap.core.errors import InputError, closest_match
@@ -37,8 +38,6 @@ from stillmap.io.text_lines import (
     strip_extension,
 )
 from stillmap.io.trajectory import pose_from_quaternion, pose_from_row, rigid_transform
-
-Float = NDArray[np.float64]
 
 # counts of the numbers of each distortion model
 MODELS = {"": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}

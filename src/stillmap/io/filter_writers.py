@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
@@ -20,7 +21,6 @@ from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
 from stillmap.io.filtered_clouds import (
     FilterJob,
-    Mask,
     Omissions,
     write_kitti,
     write_las,
@@ -199,7 +199,7 @@ def _without_beams(job: FilterJob) -> Recording:
     length = np.zeros(recording.n_scans + 1, np.int64)
     for scan in recording.iter_scans(range(recording.n_scans), job.blank):
         beams = recording.beams_of(scan)
-        stays: Mask = ~job.blank[beams]
+        stays: Bool = ~job.blank[beams]
         for name, builder in kept.items():
             builder.append(getattr(recording, name)[beams][stays])
         length[scan + 1] = np.count_nonzero(stays)

@@ -14,6 +14,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool
 from stillmap.core.arrays import release_pages
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, atomic_folder
@@ -24,8 +25,6 @@ from stillmap.io.point_cloud.clouds import files_of
 from stillmap.io.point_cloud.table import TableLayout
 from stillmap.io.text_lines import Progress, replace_words
 from stillmap.prepare.options import ReadOptions
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class FilterJob:
     source: Path
     output: Path
     recording: Recording
-    blank: Mask
+    blank: Bool
     options: ReadOptions
     marker: str = ""
     overwrite: bool = False
@@ -56,7 +55,7 @@ class FilterJob:
     progress: Progress | None = None
     kind: str = ""
 
-    def scan_masks(self, count: int) -> list[Mask | None]:
+    def scan_masks(self, count: int) -> list[Bool | None]:
         """(n,) beams to blank of the scan of each of `count` records; None: it was not read.
 
         Raises:
@@ -65,7 +64,7 @@ class FilterJob:
         record = self.recording.record
         if record is None or not ((record >= 0) & (record < count)).all():
             raise other_recording_error(self.source)
-        masks: list[Mask | None] = [None] * count
+        masks: list[Bool | None] = [None] * count
         for scan, number in enumerate(record.tolist()):
             masks[number] = self.blank[self.recording.beams_of(scan)]
         return masks
@@ -98,7 +97,7 @@ _BLOCK_BYTES = 8 << 20  # of points copied at once
 _LABEL = 4  # bytes of a label of SemanticKITTI
 
 # (file, its new copy, (n,) points to remove)
-FilterFile = Callable[[Path, Path, Mask], None]
+FilterFile = Callable[[Path, Path, Bool], None]
 
 
 def write_kitti(job: FilterJob) -> Omissions:
@@ -111,7 +110,7 @@ def write_kitti(job: FilterJob) -> Omissions:
         InputError: the source has changed since it was read, or the output cannot be written.
     """
 
-    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+    def filter_file(path: Path, new: Path, mask: Bool) -> None:
         _copy_table(kitti.scan_layout(path), new, mask)
         labels = job.source / "labels" / f"{path.stem}.label"
         if labels.is_file() and labels.stat().st_size == _LABEL * len(mask):
@@ -128,7 +127,7 @@ def write_kitti(job: FilterJob) -> Omissions:
 def write_pcd(job: FilterJob) -> Omissions:
     """Copy a PCD file or folder; points of organised clouds become NaN, others are removed."""
 
-    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+    def filter_file(path: Path, new: Path, mask: Bool) -> None:
         _copy_table(pcd.read_header(path)[0], new, mask, rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+")
 
     return _write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
@@ -138,7 +137,7 @@ def write_ply(job: FilterJob) -> Omissions:
     """Copy a PLY file or folder; vertices are removed, or become NaN where other elements, such as
     faces, may refer to them by their number."""
 
-    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+    def filter_file(path: Path, new: Path, mask: Bool) -> None:
         _copy_table(ply.read_layout(path), new, mask, rb"(?m)^(\s*element\s+vertex\s+)\d+")
 
     return _write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
@@ -185,7 +184,7 @@ def _write_files(
     return omissions
 
 
-def _write_file(file: Path, new: Path, mask: Mask, filter_file: FilterFile, suffix: str) -> None:
+def _write_file(file: Path, new: Path, mask: Bool, filter_file: FilterFile, suffix: str) -> None:
     """Write the copy of a file; the file itself where no beam is blanked and `suffix` is its."""
     if not mask.any() and file.suffix.lower() == suffix.lower():
         copy_file(file, new)
@@ -225,7 +224,7 @@ def _replace_link(folder: Path) -> None:
             (folder / entry.name).symlink_to(entry)
 
 
-def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:
+def _filter_las(path: Path, new: Path, mask: Bool, packed: bool | None) -> None:
     laspy = import_extra("laspy", path)
     with las.open_las_reader(path) as reader:
         header, first = reader.header, 0
@@ -245,7 +244,7 @@ def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:
                 writer.write_evlrs(reader.evlrs)
 
 
-def _copy_table(layout: TableLayout, new: Path, mask: Mask, counts: bytes = b"()") -> None:
+def _copy_table(layout: TableLayout, new: Path, mask: Bool, counts: bytes = b"()") -> None:
     """Copy a file without the points of a mask; where they are ordered, they stay without
     coordinates: NaN, or 0 in columns of integers.
 
@@ -277,7 +276,7 @@ def _unknown(dtype: np.dtype[Any]) -> Any:
 
 
 def _blank_records(
-    layout: TableLayout, records: NDArray[np.uint8], removed: Mask
+    layout: TableLayout, records: NDArray[np.uint8], removed: Bool
 ) -> NDArray[np.uint8]:
     """Records (n, size) without those of a mask, or without their coordinates."""
     if not layout.ordered:
@@ -289,7 +288,7 @@ def _blank_records(
     return records
 
 
-def _copy_records(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Mask) -> None:
+def _copy_records(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
     target.write(source.read(layout.start - layout.header))
     step = max(1, _BLOCK_BYTES // layout.record)
     for first in range(0, len(mask), step):
@@ -300,7 +299,7 @@ def _copy_records(source: IO[bytes], target: IO[bytes], layout: TableLayout, mas
         target.write(_blank_records(layout, rows.reshape(len(removed), -1), removed).tobytes())
 
 
-def _copy_columns(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Mask) -> None:
+def _copy_columns(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
     records = _blank_records(layout, np.hstack(pcd.unpack_columns(layout)), mask)
     ends = np.cumsum([field.size for field in layout.fields])[:-1]
     data = b"".join(column.tobytes() for column in np.hsplit(records, ends))
@@ -311,7 +310,7 @@ def _copy_columns(source: IO[bytes], target: IO[bytes], layout: TableLayout, mas
     source.seek(int.from_bytes(source.read(8)[:4], "little"), 1)
 
 
-def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Mask) -> None:
+def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
     source.seek(0)
     header_lines, row = source.read(layout.header).count(b"\n"), 0
     for _ in range(layout.lines - header_lines):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
@@ -19,8 +20,6 @@ from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.lasers import RawLaser, RawLasers, unit_vectors
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 from stillmap.prepare.prepare import prepare
-
-Float = NDArray[np.float64]
 
 FORMAT = "arrays"  # in Recording.source
 
@@ -181,7 +180,7 @@ def _describe_sensor(sensor_pose: ArrayLike | None, **notes: Any) -> SensorNotes
     return SensorNotes("sensor", extrinsics=LaserPose(how=how), **notes)
 
 
-def stamps_to_ns(stamps: ArrayLike) -> NDArray[np.int64]:
+def stamps_to_ns(stamps: ArrayLike) -> Int64:
     """(T,) int64 nanoseconds of stamps in seconds (float), nanoseconds (integer) or datetime64.
 
     Raises:
@@ -239,7 +238,7 @@ def require_length(name: str, got: int, expected: int, like: str) -> None:
         raise ValueError(f"{name}: expected {expected} as in {like}, got {got}")
 
 
-def require_all(name: str, good: NDArray[np.bool_], what: str, values: NDArray[Any]) -> None:
+def require_all(name: str, good: Bool, what: str, values: NDArray[Any]) -> None:
     """Raises ValueError with the first value (or row of values) that is not good."""
     bad = np.flatnonzero(~good)
     if len(bad):

@@ -3,14 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Index
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
-
-Float = NDArray[np.float64]
 
 # tolerance of an end point across its beam, in metres and radians
 _TOLERANCE_M, _TOLERANCE_RAD = 1e-3, 1e-4
@@ -142,7 +140,7 @@ def _range_threshold(notes: SensorNotes) -> float | None:
     return value if value is not None and value > 0.0 else None
 
 
-def _fits(angles: tuple[float, float], points: Float, usable: NDArray[np.intp]) -> bool:
+def _fits(angles: tuple[float, float], points: Float, usable: Index) -> bool:
     angle = angles[0] + angles[1] * usable
     x, y = points[usable].T
     c, s = np.cos(angle), np.sin(angle)
@@ -152,7 +150,7 @@ def _fits(angles: tuple[float, float], points: Float, usable: NDArray[np.intp]) 
     )
 
 
-def _fit_angles(points: Float, usable: NDArray[np.intp]) -> tuple[float, float]:
+def _fit_angles(points: Float, usable: Index) -> tuple[float, float]:
     """Fit first angle and step to end points, weighted by squared range."""
     x, y = points[usable].T
     angle, length = np.arctan2(y, x), np.hypot(x, y)

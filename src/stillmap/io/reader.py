@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_types import Float, Int32
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -25,8 +26,6 @@ from stillmap.io.trajectory import MAX_MOUNT, are_rigid
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import complete, interpret
 from stillmap.prepare.time_window import TimeWindow, select_time
-
-Float = NDArray[np.float64]
 
 _MAX_PAUSE = 60.0  # s between parts: recorders take less to begin a new file
 _MAX_OVERLAP = 3  # scans, of several sensors, that precede the end of the part before
@@ -330,7 +329,7 @@ def _are_continuous(parts: Sequence[Recording]) -> bool:
     return True
 
 
-def _join_sensors(parts: Sequence[Recording]) -> tuple[Float, NDArray[np.int32], list[SensorNotes]]:
+def _join_sensors(parts: Sequence[Recording]) -> tuple[Float, Int32, list[SensorNotes]]:
     """Poses of the sensors of all parts, that of each scan, and the notes on them.
 
     Those of the first part, unless one moves: then it has a pose per place, and one note.

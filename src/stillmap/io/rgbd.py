@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import camera as camera_module
 from stillmap.core import se2, se3
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError, advise
 from stillmap.core.input_files import InputFile
@@ -34,8 +35,6 @@ from stillmap.io.rgbd_calibration import calibrate_color_camera
 from stillmap.io.text_lines import read_lines
 from stillmap.io.trajectory import read_tum, rigid_transform
 from stillmap.prepare.options import ReadOptions
-
-Float = NDArray[np.float64]
 
 SCENES, TUM = "7-Scenes", "TUM RGB-D"
 
@@ -188,9 +187,7 @@ def _read_list(path: Path, warnings: list[str]) -> list[tuple[int, Path]]:
     return sorted(out, key=lambda pair: pair[0])
 
 
-def _interpolate_tum_poses(
-    path: Path, stamps: NDArray[np.int64], warnings: list[str]
-) -> list[Float | None]:
+def _interpolate_tum_poses(path: Path, stamps: Int64, warnings: list[str]) -> list[Float | None]:
     """Poses at stamps (n,), interpolated on SE(3) between the recorded ones; None: none near."""
     if not path.is_file():
         return [None] * len(stamps)
@@ -234,7 +231,7 @@ class _Grid(NamedTuple):
     width: int
     height: int
     step: int
-    rays: NDArray[np.float32]
+    rays: Float32
     scale: float
 
 
@@ -347,7 +344,7 @@ def _read_cloud(file: Path, T: Float | None, grid: _Grid) -> Cloud:
     return Cloud((grid.rays * metres[..., None]).reshape(-1, 3), T)
 
 
-def is_depth(units: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def is_depth(units: NDArray[np.uint16]) -> Bool:
     """Mask of the pixels of a depth image that hold a depth."""
     return np.asarray((units > 0) & (units < _MAX_UNITS))
 

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.camera import Camera
 from stillmap.core.errors import InputError
 from stillmap.io import cameras
-
-Float = NDArray[np.float64]
 
 # initial guess, of a Kinect: focal length per pixel of width, and baseline in metres
 _FOCAL, _BASELINE = 525.0 / 640.0, -0.025
@@ -36,7 +34,7 @@ class _Edges(NamedTuple):
     """Depth edges of one image: (n, 3) points in the depth camera, (h, w) color gradient across."""
 
     points: Float
-    gradient: NDArray[np.float32]
+    gradient: Float32
 
 
 def calibrate_color_camera(

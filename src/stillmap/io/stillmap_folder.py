@@ -22,6 +22,7 @@ from stillmap.core.array_folder import (
     read_record,
     write_arrays,
 )
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
@@ -123,7 +124,7 @@ def _read_images(path: Path, header: _Header) -> Images | None:
     return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
 
 
-def _matrix(rows: Any, n: int) -> NDArray[np.float64] | None:
+def _matrix(rows: Any, n: int) -> Float | None:
     return None if rows is None else np.array(rows, np.float64).reshape(n, n)
 
 
@@ -185,7 +186,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     def load(name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
         return read_array(path / f"{name}.npy", shape, dtype, scratch, grows=grows)
 
-    def load_poses(name: str, count: int) -> NDArray[np.float64]:
+    def load_poses(name: str, count: int) -> Float:
         return read_poses(path / f"{name}.npy", count, D, MAX_TRANSLATION, grows=grows)
 
     stamp_ns, offset = load("stamp_ns", (T,), np.int64), load("offset", (T + 1,), np.int64)
@@ -250,7 +251,7 @@ def _read_header(path: Path) -> _Header:
     return parse(record, _Header, path)
 
 
-def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
+def _check_points(path: Path, points: Float32, hit: Bool) -> None:
     for block in iter_blocks(points, hit):
         is_known = (np.abs(points[block]) <= MAX_POINT_DISTANCE).all(axis=1)
         is_unusable = np.isnan(points[block]).any(axis=1) & ~hit[block]

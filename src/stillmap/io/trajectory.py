@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
@@ -30,7 +31,7 @@ MAX_TRANSLATION = 1e9  # m
 MAX_MOUNT = 1e5  # m from the robot's base to a sensor; the kernels' cells end at a few hundred km
 
 
-def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
+def rigid_transform(R: ArrayLike, t: ArrayLike) -> Float:
     """(4, 4) transform of a rounded rotation (3, 3), projected onto SO(3), and a translation (m).
 
     Raises:
@@ -50,7 +51,7 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     return T
 
 
-def are_rigid(T: NDArray[np.float64]) -> bool:
+def are_rigid(T: Float) -> bool:
     """True if all of (N, D+1, D+1) matrices are rigid transforms within the tolerance."""
     D = T.shape[-1] - 1
     R, t = T[:, :D, :D], T[:, :D, D]
@@ -61,7 +62,7 @@ def are_rigid(T: NDArray[np.float64]) -> bool:
     return bool(is_orthogonal.all() and is_affine and (np.linalg.det(R) > 0.0).all())
 
 
-def pose_from_row(row: ArrayLike) -> NDArray[np.float64]:
+def pose_from_row(row: ArrayLike) -> Float:
     """(4, 4) transform of its first three rows, 12 numbers.
 
     Raises:
@@ -71,7 +72,7 @@ def pose_from_row(row: ArrayLike) -> NDArray[np.float64]:
     return rigid_transform(upper[:, :3], upper[:, 3])
 
 
-def pose_from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
+def pose_from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> Float:
     """(4, 4) transform of a quaternion w x y z and a translation in metres.
 
     Raises:
@@ -83,13 +84,13 @@ def pose_from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     return rigid_transform(_rotations().from_quat(q[[1, 2, 3, 0]]).as_matrix(), t)
 
 
-def quaternion_from_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_from_pose(T: Float) -> Float:
     """(..., 4) quaternions w x y z, w >= 0, of transforms (..., 4, 4)."""
     xyzw = _rotations().from_matrix(T[..., :3, :3]).as_quat(canonical=True)
     return np.asarray(xyzw)[..., [3, 0, 1, 2]]
 
 
-def embed_in_3d(T: NDArray[np.float64]) -> NDArray[np.float64]:
+def embed_in_3d(T: Float) -> Float:
     """(..., 4, 4) poses of (..., D+1, D+1); 2D poses lie at z = 0."""
     if T.shape[-1] == 4:
         return T
@@ -99,7 +100,7 @@ def embed_in_3d(T: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+def write_tum(path: Path, stamp_ns: Int64, poses: Float) -> None:
     """Write one line per pose.
 
     Args:
@@ -117,7 +118,7 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
                 file.write(f"{format_seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
 
-def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def read_tum(path: Path) -> tuple[Int64, Float]:
     """Stamps (T,) int64 in nanoseconds and poses (T, 4, 4) of a TUM file, in the file's order.
 
     Stamps are parsed as decimals, never as floats; digits beyond nanoseconds are rounded.
@@ -144,7 +145,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return np.array(stamps, np.int64), poses_from_rows(np.array(rows))
 
 
-def poses_from_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def poses_from_rows(rows: Float) -> Float:
     """(T, 4, 4) of rows (T, 7) x y z qx qy qz qw.
 
     Raises:
@@ -162,7 +163,7 @@ def _rotations() -> "type[Rotation]":
     return Rotation
 
 
-def pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def pose_rows(poses: Float) -> Float:
     """(T, 7) x y z qx qy qz qw with qw >= 0."""
     rows = np.zeros((len(poses), 7))
     dimension = poses.shape[-1] - 1
@@ -192,9 +193,7 @@ def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
     return stamp, row
 
 
-def interpolate(
-    stamp_ns: NDArray[np.int64], poses: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], int]:
+def interpolate(stamp_ns: Int64, poses: Float, at_ns: Int64) -> tuple[Float, int]:
     """Interpolate poses: linear in x and y, along the shortest arc in theta.
 
     Args:
@@ -223,7 +222,7 @@ def interpolate(
 _TOLERANCE_NS = 20_000_000  # other tools round stamps
 
 
-def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
+def poses_from_tum(path: Path, recording: Recording) -> Float:
     """(T, D+1, D+1) T_map_base at the scans of a recording, from a TUM trajectory.
 
     A trajectory with exactly the stamps of the recording is used row by row (stamps may repeat);
@@ -249,7 +248,7 @@ def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     return poses[nearest]
 
 
-def _nearest_index(sorted_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _nearest_index(sorted_ns: Int64, wanted_ns: Int64) -> Int64:
     last = len(sorted_ns) - 1
     right = np.clip(np.searchsorted(sorted_ns, wanted_ns), min(last, 1), last)
     left = np.maximum(right - 1, 0)

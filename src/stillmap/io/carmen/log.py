@@ -24,16 +24,14 @@ from sys import maxsize
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.timestamps import longest_non_decreasing, parse_ns
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
 from stillmap.prepare.lasers import RawLaser
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow
-
-Float = NDArray[np.float64]
 
 BAD_LINE = "line that cannot be read"
 TIME_BACKWARDS = "time running backwards"
@@ -186,8 +184,8 @@ class LaserLog:
         robot_poses, laser_poses: (T, 3) on the lines; None: they have none.
     """
 
-    line: NDArray[np.int64]
-    stamp_ns: NDArray[np.int64]
+    line: Int64
+    stamp_ns: Int64
     n_readings: int
     laser_poses: Float | None = None
     robot_poses: Float | None = None

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError, advise
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.io import trajectory
@@ -25,8 +25,6 @@ from stillmap.io.text_lines import Line, read_head
 from stillmap.prepare.lasers import RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.time_window import TimeWindow
-
-Float = NDArray[np.float64]
 
 TIME_BACKWARDS = "time running backwards"
 _HEAD = 1 << 18  # bytes with the PARAM lines of a log

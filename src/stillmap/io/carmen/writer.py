@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import RangeRule
@@ -28,8 +28,6 @@ from stillmap.io.text_lines import read_lines, replace_words, write_atomically
 from stillmap.prepare.max_range import MIN_ZERO_SHARE, find_max_range
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.prepare.time_window import TimeWindow
-
-Float = NDArray[np.float64]
 
 NO_RETURN = 81.83  # m, what a SICK LMS reports for no return
 
@@ -169,7 +167,7 @@ def _choose_format(recording: Recording) -> LogFormat:
     return LogFormat(tuple(lasers), angles, params)
 
 
-def _require_one_count(counts: NDArray[np.int64]) -> None:
+def _require_one_count(counts: Int64) -> None:
     sizes = np.unique(counts)
     if len(sizes) > 1 or np.any(sizes == 0):
         what = "in a CARMEN log all scans of a laser have the same number"
@@ -190,7 +188,7 @@ def _is_upside_down(angles: Float) -> bool:
     return bool(decrease.any())
 
 
-def _are_half_circles(angles: Float, counts: NDArray[np.int64]) -> bool:
+def _are_half_circles(angles: Float, counts: Int64) -> bool:
     """True if first and last beams have the directions of FLASER lines with as many readings."""
     expected = {int(n): flaser_config(int(n))[:2] for n in np.unique(counts)}
     off = angles - np.array([expected[n] for n in counts.tolist()]).reshape(-1, 2)
@@ -260,7 +258,7 @@ def write_filtered(job: FilterJob) -> Omissions:
     return Omissions(omitted)
 
 
-def find_no_return_code(readings: NDArray[np.float32], rule: RangeRule | None) -> bytes:
+def find_no_return_code(readings: Float32, rule: RangeRule | None) -> bytes:
     """The reading that means "no return" for a laser.
 
     Args:
@@ -292,7 +290,7 @@ def _number_lines(job: FilterJob, lasers: list[LaserLog]) -> dict[int, int]:
     raise other_recording_error(job.source)
 
 
-def _blank_readings(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
+def _blank_readings(text: bytes, blank: Bool, code: bytes) -> bytes:
     """A scan line with the readings `blank` (n,) replaced by the code."""
     line = text.removeprefix(BYTE_ORDER_MARK)
     first = first_reading(line.split(maxsplit=1)[0])

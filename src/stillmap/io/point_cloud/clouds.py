@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import finite_rows
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, MissingExtra
@@ -36,7 +37,7 @@ class Cloud(NamedTuple):
     """
 
     points: NDArray[Any]
-    T: NDArray[np.float64] | None = None
+    T: Float | None = None
     times: NDArray[Any] | None = None
     stamp_ns: int | None = None
 
@@ -172,7 +173,7 @@ class _ScanBuilder:
         self._period = _median_period(sources)
         self._builder: RecordingBuilder | None = None
         self._clock: Clock | None = None
-        self._poses: list[NDArray[np.float64] | None] = []
+        self._poses: list[Float | None] = []
         self.numbers: list[int] = []
         self._without_stamp = 0
 
@@ -213,7 +214,7 @@ class _ScanBuilder:
             images=images,
         )
 
-    def _stack_poses(self) -> NDArray[np.float64] | None:
+    def _stack_poses(self) -> Float | None:
         poses = [T for T in self._poses if T is not None]
         if not poses or all(np.array_equal(T, np.eye(4)) for T in poses):
             return None
@@ -232,7 +233,7 @@ def _median_period(sources: Sequence[CloudSource]) -> float | None:
     return float(np.median(np.diff(np.sort(np.array(stamps, np.int64))))) / 1e9
 
 
-def _usable_mask(points: NDArray[Any]) -> NDArray[np.bool_]:
+def _usable_mask(points: NDArray[Any]) -> Bool:
     plausible = (np.abs(points) <= MAX_POINT_DISTANCE).all(axis=1)
     return np.asarray(plausible & np.any(points != 0, axis=1))
 
@@ -264,10 +265,10 @@ class Origin:
     its median, rounded to metres.
     """
 
-    def __init__(self, position: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, position: Float | None = None) -> None:
         self.position = position
 
-    def shift(self, points: NDArray[Any]) -> NDArray[np.float32]:
+    def shift(self, points: NDArray[Any]) -> Float32:
         """(n, 3) points relative to the origin, of recorded points (n, 3) in metres."""
         points = np.asarray(points, np.float64)
         if self.position is None:
@@ -297,16 +298,14 @@ class Origin:
         recording.source.warnings.append(f"no sensor pose is recorded: beams start at {at}")
 
 
-def cloud_origin(recording: Recording) -> NDArray[np.float64]:
+def cloud_origin(recording: Recording) -> Float:
     """(3,) metres by which the coordinates of a recording's clouds were shifted in reading."""
     noted = recording.source.origin if recording.dimension == 3 else None
     origin = np.array(noted or (0.0, 0.0, 0.0))
     return origin if (np.abs(origin) < MAX_TRANSLATION).all() else np.zeros(3)
 
 
-def place_clouds(
-    recording: Recording, poses: NDArray[np.float64] | None
-) -> NDArray[np.float64] | None:
+def place_clouds(recording: Recording, poses: Float | None) -> Float | None:
     """Poses (T, D+1, D+1) for writing; None: there are none, and the coordinates are as they were.
 
     Args:
@@ -323,7 +322,7 @@ def place_clouds(
     return placed
 
 
-def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _find_origin(points: Float) -> Float | None:
     finite = points[finite_rows(points)]
     if not len(finite):
         return None
@@ -332,17 +331,13 @@ def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
 
 
-def sensor_poses(
-    recording: Recording, T_map_base: NDArray[np.float64] | None
-) -> NDArray[np.float64] | None:
+def sensor_poses(recording: Recording, T_map_base: Float | None) -> Float | None:
     """(T, 4, 4) sensor poses of robot poses (T, D+1, D+1), for writing; see `place_clouds`."""
     T = place_clouds(recording, T_map_base)
     return None if T is None else embed_in_3d(recording.T_map_sensor(T))
 
 
-def scan_hits(
-    recording: Recording, scan: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+def scan_hits(recording: Recording, scan: int) -> tuple[Float32, Float32 | None]:
     """(n, 3) hits of a scan in the sensor frame, and their times (n,) or None."""
     beams = recording.beams_of(scan)
     hit = recording.hit[beams]
@@ -350,9 +345,7 @@ def scan_hits(
     return _to_3d(recording.points[beams][hit]), times
 
 
-def iter_map_points(
-    recording: Recording, T_map_base: NDArray[np.float64]
-) -> Iterator[NDArray[np.float64]]:
+def iter_map_points(recording: Recording, T_map_base: Float) -> Iterator[Float]:
     """Yield all hits in the map frame in blocks (n, 3), in recording order.
 
     Args:

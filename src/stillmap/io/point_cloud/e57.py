@@ -13,8 +13,8 @@ from typing import Any
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
@@ -202,7 +202,7 @@ def _iter_blocks(library: Any, file: Any, node: Any, path: Path) -> Iterator[Col
             yield [np.where(invalid, np.nan, column) for column in columns]
 
 
-def _read_pose(node: Any) -> NDArray[np.float64] | None:
+def _read_pose(node: Any) -> Float | None:
     if not node.isDefined("pose"):
         return None
     pose = node["pose"]

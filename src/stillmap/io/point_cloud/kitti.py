@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
@@ -31,8 +31,6 @@ from stillmap.io.point_cloud.clouds import (
 from stillmap.io.point_cloud.table import Field, TableLayout, parse_numbers
 from stillmap.io.text_lines import assign_rows, list_files, read_times, stamp_files
 from stillmap.io.trajectory import pose_from_row, rigid_transform
-
-Float = NDArray[np.float64]
 
 MARKER = "times.txt"  # only folders with this file are overwritten
 

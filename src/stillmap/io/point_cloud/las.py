@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import InputFile
@@ -123,7 +123,7 @@ def _count_chunks(file: IO[bytes], start: int, size: int) -> int:
     return int.from_bytes(file.read(4), "little")
 
 
-def write(recording: Recording, path: Path, poses: NDArray[np.float64]) -> None:
+def write(recording: Recording, path: Path, poses: Float) -> None:
     """Write all hits in the map frame as one LAS or (by extension) LAZ cloud, atomically.
 
     Coordinates are rounded to 0.1 mm.
@@ -183,7 +183,7 @@ class _ErrorKeepingWriter(io.BufferedWriter):
             raise
 
 
-def _make_header(laspy: Any, poses: NDArray[np.float64]) -> Any:
+def _make_header(laspy: Any, poses: Float) -> Any:
     header = laspy.LasHeader(point_format=0, version="1.2")
     header.scales = np.full(3, SCALE)
     # 32 bit coordinates, relative to the first pose

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
 from stillmap.core.input_files import InputFile
@@ -41,7 +42,7 @@ _MAX_EXPANSION = 100  # unpacked over packed bytes: LZF reaches a little less
 _MIN_VIEWPOINT_DISTANCE = 5.0  # m from the origin, to detect the frame of the points
 
 
-Header = tuple[TableLayout, NDArray[np.float64] | None]
+Header = tuple[TableLayout, Float | None]
 
 
 def is_pcd(head: bytes) -> bool:
@@ -94,7 +95,7 @@ def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: 
     return layout, _parse_viewpoint(entries.get("VIEWPOINT"))
 
 
-def _parse_viewpoint(words: list[str] | None) -> NDArray[np.float64] | None:
+def _parse_viewpoint(words: list[str] | None) -> Float | None:
     if words is None:
         return np.eye(4)
     try:
@@ -236,7 +237,7 @@ def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str
     return describe_non_returns(recording)
 
 
-def _encode_scan(recording: Recording, scan: int, T: NDArray[np.float64]) -> bytes:
+def _encode_scan(recording: Recording, scan: int, T: Float) -> bytes:
     points, times = scan_hits(recording, scan)
     rows = points if times is None else np.column_stack([points, times])
     names = ["x", "y", "z", "time"][: rows.shape[1]]

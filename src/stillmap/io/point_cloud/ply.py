@@ -6,8 +6,8 @@ The reason is in CONTRIBUTING.md.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
@@ -97,7 +97,7 @@ def _parse_header(path: Path, lines: list[list[str]], header: int) -> TableLayou
     raise ValueError("no vertices")
 
 
-def write(recording: Recording, path: Path, poses: NDArray[np.float64]) -> None:
+def write(recording: Recording, path: Path, poses: Float) -> None:
     """Write all hits in the map frame as one binary cloud, atomically.
 
     Args:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
@@ -125,7 +126,7 @@ def gather_points(
     blocks: Iterable[Columns],
     convert: Callable[[NDArray[Any]], NDArray[Any]],
     scratch: Path | None = None,
-) -> tuple[NDArray[np.float32], list[NDArray[Any]]]:
+) -> tuple[Float32, list[NDArray[Any]]]:
     """Points (n, 3) of blocks of x, y, z and further columns, and those columns.
 
     Args:
@@ -227,7 +228,7 @@ def is_blank(line: bytes) -> bool:
 
 def parse_numbers(
     lines: Iterator[bytes], rows: int, use: Sequence[int] | None, path: Path
-) -> NDArray[np.float64]:
+) -> Float:
     """Parse up to `rows` lines into (k, columns) float64.
 
     Raises:
@@ -285,8 +286,8 @@ def detect_clock(values: NDArray[Any], period: float | None) -> Clock | None:
 
 
 def convert_times(
-    values: NDArray[Any], usable: NDArray[np.bool_], clock: Clock, stamp_ns: int | None
-) -> tuple[int | None, NDArray[np.float64]]:
+    values: NDArray[Any], usable: Bool, clock: Clock, stamp_ns: int | None
+) -> tuple[int | None, Float]:
     """The stamp of a scan, and seconds (n,) from it to each point, NaN where unknown.
 
     Args:
@@ -316,5 +317,5 @@ def convert_times(
     return stamp_ns, _drop_outliers(after)
 
 
-def _drop_outliers(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+def _drop_outliers(seconds: Float) -> Float:
     return np.where(np.abs(seconds) <= MAX_BEAM_TIME, seconds, np.nan)

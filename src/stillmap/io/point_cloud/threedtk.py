@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
@@ -90,7 +90,7 @@ def _read_heading(path: Path) -> tuple[int, int]:
     raise InputError("is empty", where=str(path))
 
 
-def _read_pose(path: Path) -> NDArray[np.float64] | None:
+def _read_pose(path: Path) -> Float | None:
     """(4, 4) pose in the file beside a scan; None where there is no valid one."""
     from scipy.spatial.transform import Rotation
 

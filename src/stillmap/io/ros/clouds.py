@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Index
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -143,7 +144,7 @@ class CloudCollector:
         self.number.append(number)
         return None
 
-    def forward_scans(self, sensor: int) -> NDArray[np.intp]:
+    def forward_scans(self, sensor: int) -> Index:
         """The scans of a sensor with non-decreasing stamps; others are counted."""
         rows = np.flatnonzero(np.asarray(self.scans.sensor) == sensor)
         keep = longest_non_decreasing(np.asarray(self.scans.stamp_ns)[rows].tolist())

@@ -6,9 +6,10 @@ from typing import Any, cast
 
 import numpy as np
 
+from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
-from stillmap.io.filtered_clouds import FilterJob, Mask, Omissions, other_recording_error
+from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import (
@@ -95,7 +96,7 @@ def _number_scans(job: FilterJob) -> tuple[set[str], dict[tuple[str, int], int]]
     return set(topic), {key: scan for scan, key in enumerate(keys)}
 
 
-def _blank(message: Message, mask: Mask, job: FilterJob) -> Any:
+def _blank(message: Message, mask: Bool, job: FilterJob) -> Any:
     """The content of a message without the readings or points `mask` (n,)."""
     content, topic = decode(message), message.channel.topic
     if message.channel.type == POINT_CLOUD:
@@ -112,7 +113,7 @@ def _blank(message: Message, mask: Mask, job: FilterJob) -> Any:
     return content
 
 
-def _blank_points(cloud: Any, mask: Mask, topic: str) -> None:
+def _blank_points(cloud: Any, mask: Bool, topic: str) -> None:
     """Remove points of a PointCloud2, or their coordinates where it has rows of points."""
     layout = find_layout(cloud)
     if isinstance(layout, str) or layout.n_points != len(mask):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io.cameras import to_array
@@ -116,9 +117,7 @@ def _apply_camera_info(camera: Camera, info: Any) -> Camera:
     )
 
 
-def _rectify_pose(
-    T: NDArray[np.float64] | None, R: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def _rectify_pose(T: Float | None, R: Float) -> Float | None:
     """Rotate a camera pose (4, 4) by R (9,); unchanged where R is no rotation."""
     try:
         turn = rigid_transform(R, np.zeros(3))

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, advise
 from stillmap.core.source import LaserPose, SensorNotes, Source
@@ -31,8 +31,6 @@ from stillmap.io.ros.messages import (
 )
 from stillmap.prepare.lasers import Beams, RawLaser, RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-
-Float = NDArray[np.float64]
 
 REPEATED = "scan that was recorded twice"
 
@@ -82,7 +80,7 @@ class LaserScans:
     """
 
     raw: RawLaser
-    number: NDArray[np.int64]
+    number: Int64
     shape: ScanShape
 
     def __init__(self, topic: str, frame: str, scratch: Path | None) -> None:
@@ -92,9 +90,7 @@ class LaserScans:
         self._shapes: dict[ScanShape, int] = {}
         self._ranges = ArrayBuilder(np.float32, (), scratch)
 
-    def add(
-        self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
-    ) -> str | None:
+    def add(self, message: Any, ranges: Float32, log_ns: int, number: int) -> str | None:
         """Add a scan; returns the reason if it cannot be used."""
         names = ("range_min", "range_max", "time_increment")
         more = (getattr(message, name) for name in names)
@@ -144,7 +140,7 @@ class LaserScans:
         return len(self.number)
 
 
-def _beam_steps(stamps: NDArray[np.int64], shapes: list[ScanShape]) -> tuple[float, ...]:
+def _beam_steps(stamps: Int64, shapes: list[ScanShape]) -> tuple[float, ...]:
     """Seconds from beam to beam of each shape; 0 where missing or implausible."""
     span = float(stamps[-1] - stamps[0]) / 1e9
     # 1 / rate, as it was always rounded
@@ -189,7 +185,7 @@ class LaserCollector:
         return sorted(beams, key=lambda s: (-s.n_scans, -beams[s], s.topic))
 
 
-def _first_echoes(scan: Any) -> NDArray[np.float32]:
+def _first_echoes(scan: Any) -> Float32:
     """(n,) the first echo of each beam: glass and rain return further ones."""
     return np.array([e.echoes[0] if len(e.echoes) else np.nan for e in scan.ranges], np.float32)
 
@@ -308,7 +304,7 @@ def _convert_to_3d(
     T_base_sensor: Float,
     scratch: Path | None,
     beams: Beams,
-) -> tuple[NDArray[np.float32], list[str]]:
+) -> tuple[Float32, list[str]]:
     """Points (M, 3) in the laser's frame at its scan's stamp, and a warning about lost beams."""
     points = arrays.empty((len(beams.points), 3), np.float32, scratch)
     stamps, M, n_lost = np.sort(tree.stamps_between(base, scans.frame)), len(points), 0
@@ -331,7 +327,7 @@ def _convert_to_3d(
     return points, [text] * (n_lost > 0)
 
 
-def _is_covered(stamps: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_covered(stamps: Int64, at_ns: Int64) -> Bool:
     """(n,) whether times lie on, or between close, sorted stamps."""
     after = np.searchsorted(stamps, at_ns)
     inside = (after > 0) & (after < len(stamps))

@@ -5,19 +5,16 @@ from array import array
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.options import ReadOptions
-
-Float = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 
 SENSOR_IS_BASE = "the sensor's frame: no transform gives its pose on a robot"
 
@@ -62,7 +59,7 @@ class _Edge:
         out.constant = self.constant or bool(np.all(values == values[last[0]]))
         return out
 
-    def interpolate(self, at_ns: Stamps) -> tuple[Float, int]:
+    def interpolate(self, at_ns: Int64) -> tuple[Float, int]:
         """Transforms (N, 4, 4) at times (N,), and how many of these lie outside the known ones."""
         stamps, values = np.asarray(self.stamp_ns), np.asarray(self.values).reshape(-1, 7)
         if self.constant or len(stamps) == 1:
@@ -142,7 +139,7 @@ class TransformTree:
             path.append(parent)
         return path
 
-    def lookup(self, target: str, source: str, at_ns: Stamps) -> Lookup | None:
+    def lookup(self, target: str, source: str, at_ns: Int64) -> Lookup | None:
         """T_target_source at times (N,); None if the frames are not connected."""
         up, down = self.path_to_root(source), self.path_to_root(target)
         common = next((name for name in up if name in down), None)
@@ -154,15 +151,15 @@ class TransformTree:
         moves = rising.moves or falling.moves
         return Lookup(T, max(rising.outside, falling.outside), moves)
 
-    def stamps_between(self, target: str, source: str) -> Stamps:
-        """Stamps of the moving frame between source and its ancestor target with fewest stamps."""
+    def stamps_between(self, target: str, source: str) -> Int64:
+        """Int64 of the moving frame between source and its ancestor target with fewest stamps."""
         up = self.path_to_root(source)
         end = up.index(target) if target in up else 0
         moving = [self._resolve()[child] for child in up[:end] if self.is_moving(child)]
         rarest = min(moving, key=lambda edge: len(edge.stamp_ns), default=None)
         return np.asarray(rarest.stamp_ns if rarest else [], np.int64)
 
-    def _compose(self, path: list[str], at_ns: Stamps) -> Lookup:
+    def _compose(self, path: list[str], at_ns: Int64) -> Lookup:
         """Transforms from the first frame of a path to the parent of its last."""
         T = np.broadcast_to(np.eye(4), (len(at_ns), 4, 4))
         outside, moves = 0, False
@@ -208,7 +205,7 @@ class Odometry:
             self.child = frame_name(message.child_frame_id)
             self.stamp_ns.append(stamp)
 
-    def poses_at(self, at_ns: Stamps) -> Lookup:
+    def poses_at(self, at_ns: Int64) -> Lookup:
         """T_frame_child at times (N,)."""
         poses = self._tree.lookup("odometry", "robot", at_ns)
         assert poses is not None
@@ -227,7 +224,7 @@ class Sensor(NamedTuple):
 
     topic: str
     frame: str
-    stamp_ns: Stamps
+    stamp_ns: Int64
 
 
 class SensorPoses(NamedTuple):
@@ -337,7 +334,7 @@ def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
 
 
 def find_odometry(
-    frames: Frames, base: str, at_ns: Stamps, options: ReadOptions, warnings: list[str]
+    frames: Frames, base: str, at_ns: Int64, options: ReadOptions, warnings: list[str]
 ) -> tuple[Float | None, dict[str, Any]]:
     """Odometry (T, 4, 4) at the scans, and its origin (for `source`); adds warnings.
 
@@ -370,7 +367,7 @@ def find_odometry(
     return None, {"from": None, "outside": 0}
 
 
-def _warn_of_gaps(outside: int, stamps: Stamps, at_ns: Stamps, warnings: list[str]) -> None:
+def _warn_of_gaps(outside: int, stamps: Int64, at_ns: Int64, warnings: list[str]) -> None:
     """Warn of scans at times (T,) outside odometry of these stamps, or in a gap of it."""
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")

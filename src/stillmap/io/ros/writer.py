@@ -15,6 +15,7 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from stillmap.core import files
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import laser_scan
@@ -29,7 +30,6 @@ from stillmap.io.ros.messages import (
     load_typestore,
 )
 
-Float = NDArray[np.float64]
 Fields = dict[str, Any]  # of a message: missing ones are zero, those it does not have left out
 Send = Callable[[int, Fields], None]  # stamp in ns, message
 SendRaw = Callable[[int, bytes], None]
@@ -236,7 +236,7 @@ def make_odometry(stamp_ns: int, T_odom_base: Float) -> Fields:
     return {"header": header, "child_frame_id": BASE, "pose": pose}
 
 
-def make_path(stamp_ns: NDArray[np.int64], poses: Float) -> Fields:
+def make_path(stamp_ns: Int64, poses: Float) -> Fields:
     """A Path in the map frame along T_map_base (T, D+1, D+1)."""
     stamped = [
         {"header": make_header(stamp, MAP), "pose": make_pose(T)}
@@ -327,11 +327,11 @@ class LaserScanEncoder:
         self._range_max = [limits.max_range() for limits in laser_scan.range_limits(recording)]
         self._time_increments, self._n_uneven = laser_scan.time_increments(recording)
 
-    def ranges(self, t: int) -> NDArray[np.float32]:
+    def ranges(self, t: int) -> Float32:
         """(n,) metres of a scan, +inf at maximum range, NaN where unusable."""
         return laser_scan.beam_ranges(self._recording, t, np.inf).astype(np.float32)
 
-    def make_message(self, t: int, frame: str, ranges: NDArray[np.float32]) -> Fields:
+    def make_message(self, t: int, frame: str, ranges: Float32) -> Fields:
         """The message of scan t with ranges (n,)."""
         start, step = self._angles[t].tolist()
         return {
