@@ -1,7 +1,8 @@
 """Builds a recording scan by scan, of any size, and counts the records that were skipped."""
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float, Index, Int64
 from stillmap.core.arrays import ArrayBuilder, empty, squared_lengths
-from stillmap.core.errors import advise
+from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.core.source import Skipped, Source
 from stillmap.core.timestamps import MAX_BEAM_TIME
@@ -43,6 +44,29 @@ def part_context(context: ReadContext, number: int, count: int) -> ReadContext:
     options = replace(context.options, start=None, end=None)
     progress = share_progress(context.progress, number, count)
     return ReadContext(options, progress, context.scratch)
+
+
+@contextmanager
+def explain_failure(path: str | Path) -> Iterator[None]:
+    """Within this context, files that vanish and full disks are errors of the input.
+
+    Raises:
+        InputError: it names the file.
+    """
+    try:
+        # damaged numbers are handled by the readers: no warnings of NumPy
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
+    except InputError as error:
+        if error.where:
+            raise
+        raise InputError(error.what, where=str(path), hint=error.hint) from error
+    except (OSError, MemoryError) as error:
+        # files may vanish and disks fill up at any moment
+        what, where = "does not fit into memory", path
+        if isinstance(error, OSError):
+            what, where = f"cannot be read: {error.strerror or error}", error.filename or path
+        raise InputError(what, where=str(where)) from error
 
 
 class RecordingBuilder:

@@ -2,8 +2,7 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +18,13 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import Part, SensorNotes, Skipped, Source
 from stillmap.io import cameras
-from stillmap.io.builder import MAX_LINE_NUMBERS, ReadContext, part_context, reorder_scans
+from stillmap.io.builder import (
+    MAX_LINE_NUMBERS,
+    ReadContext,
+    explain_failure,
+    part_context,
+    reorder_scans,
+)
 from stillmap.io.registry import Format, detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import MAX_MOUNT, are_rigid
@@ -118,29 +123,6 @@ def _finish(
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))
     return cameras.add_calibration_warnings(recording)
-
-
-@contextmanager
-def explain_failure(path: Path) -> Iterator[None]:
-    """Within this context, files that vanish and full disks are errors of the input.
-
-    Raises:
-        InputError: it names the file.
-    """
-    try:
-        # damaged numbers are handled by the readers: no warnings of NumPy
-        with np.errstate(over="ignore", invalid="ignore"):
-            yield
-    except InputError as error:
-        if error.where:
-            raise
-        raise InputError(error.what, where=str(path), hint=error.hint) from error
-    except OSError as error:
-        # files may vanish and disks fill up at any moment
-        what = f"cannot be read: {error.strerror or error}"
-        raise InputError(what, where=str(error.filename or path)) from error
-    except MemoryError as error:
-        raise InputError("does not fit into memory", where=str(path)) from error
 
 
 def require_mounts(recording: Recording, where: str) -> None:

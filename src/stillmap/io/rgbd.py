@@ -38,6 +38,8 @@ from stillmap.prepare.options import ReadOptions
 
 SCENES, TUM = "7-Scenes", "TUM RGB-D"
 
+# focal length and centre that are assumed, pixels; depth units per metre
+_USUAL = {SCENES: (585.0, 320.0, 240.0, 1000.0), TUM: (525.0, 319.5, 239.5, 5000.0)}
 _FRAME = re.compile(r"frame-([0-9]{1,9})\.(depth|color)\.(png|jpg|jpeg)")
 _INTRINSICS = ("camera-intrinsics.txt", "camera.txt")
 _RATE = 30  # images per second where no file holds stamps
@@ -52,8 +54,6 @@ class Frames(NamedTuple):
         depth, color: stamps (ns) and files, ordered by stamp.
         T_world_camera: poses of the depth images, (4, 4) or None; x right, y down, z ahead.
         K: (3, 3) intrinsics of the depth camera; None where no file holds them.
-        default_K: intrinsics assumed where K is None.
-        scale: depth units per metre.
         warnings: on what could not be used.
     """
 
@@ -62,8 +62,6 @@ class Frames(NamedTuple):
     color: list[tuple[int, Path]]
     T_world_camera: list[Float | None]
     K: Float | None
-    default_K: Float
-    scale: float
     warnings: list[str]
 
 
@@ -104,8 +102,6 @@ def _list_scenes(path: Path) -> Frames:
         sorted(by_kind["color"]),
         [_read_pose(file) for _, file in depth],
         _read_intrinsics(path, warnings),
-        np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]]),
-        1000.0,
         warnings,
     )
 
@@ -162,8 +158,6 @@ def _list_tum(path: Path) -> Frames:
         color,
         _interpolate_tum_poses(path / "groundtruth.txt", stamps, warnings),
         _read_intrinsics(path, warnings),
-        np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]]),
-        5000.0,
         warnings,
     )
 
@@ -249,7 +243,7 @@ def read(path: Path, context: ReadContext) -> Recording:
         overrides = cameras.read_camera_file(Path(options.cameras), (DEPTH, COLOR))
     notes = Source(str(path), format=frames.format, warnings=list(frames.warnings))
     depth = read_depth_camera(frames, overrides, notes.warnings)
-    grid = _make_grid(depth, options, options.depth_scale or frames.scale)
+    grid = _make_grid(depth, options, options.depth_scale or _USUAL[frames.format][-1])
     sources = _list_sources(frames, depth, grid)
     may_differ = frames.format == SCENES
     may_differ &= overrides.keys().isdisjoint((COLOR, DEPTH))
@@ -292,8 +286,8 @@ def read_depth_camera(
         what = f"images have {width} x {height} pixels, the size given for '{DEPTH}' differs"
         raise InputError(what, where=str(frames.depth[0][1]))
     if camera.K is None:
-        camera = replace(camera, K=frames.default_K)
-        fx, cx, cy = frames.default_K[[0, 0, 1], [0, 2, 2]]
+        fx, cx, cy, _ = _USUAL[frames.format]
+        camera = replace(camera, K=np.array([[fx, 0.0, cx], [0.0, fx, cy], [0.0, 0.0, 1.0]]))
         warnings.append(
             advise(
                 f"no calibration of the depth camera: a focal length of {fx:g} pixels and the "

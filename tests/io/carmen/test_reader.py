@@ -164,13 +164,6 @@ def test_duplicate_lines_are_dropped(read_log):
     assert recording.source.skipped == {}
 
 
-def test_angles_that_contradict_the_field_of_view(read_log):
-    header = "0 -1.57 3.14 0.00872 20.0 0.01 0"
-    ranges = " ".join(["1.0"] * 180)
-    recording = read_log([f"RAWLASER1 {header} 180 {ranges} 0 1.0 host 0.1"])
-    assert any("field of view" in warning for warning in recording.source.warnings)
-
-
 def test_constant_scan_poses_are_ignored(read_log, flaser):
     recording = read_log(
         ["ODOM 1 0 0 0 0 0 1.0 host 0", flaser(1.5), flaser(2.0), "ODOM 3 0 0 0 0 0 2.0 host 0"]

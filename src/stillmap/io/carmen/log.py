@@ -58,7 +58,6 @@ class ScanConfig(NamedTuple):
     start_angle: float  # rad
     angle_step: float  # rad
     max_range: float | None = None  # m
-    field_of_view: float | None = None  # rad, as declared
 
 
 class ScanLine(NamedTuple):
@@ -161,12 +160,11 @@ def _parse_pose(fields: list[bytes]) -> list[float]:
 def _parse_header(header: list[bytes], n: int) -> ScanConfig:
     """Start, step and declared maximum; a missing step follows from the field of view."""
     start, fov, step, max_range = _parse_numbers(header[1:5])
-    stated_fov = fov if 0.0 < fov <= 2.1 * math.pi else None
-    if not 0.0 < step < math.pi and stated_fov is not None:
-        step = stated_fov / max(n - 1, 1)
+    if not 0.0 < step < math.pi and 0.0 < fov <= 2.1 * math.pi:
+        step = fov / max(n - 1, 1)
     if not (0.0 < step < math.pi and abs(start) <= 4.0 * math.pi):
         raise ValueError(BAD_LINE)
-    return ScanConfig(start, step, max_range if 0.0 < max_range < math.inf else None, stated_fov)
+    return ScanConfig(start, step, max_range if 0.0 < max_range < math.inf else None)
 
 
 class LaserLog:

@@ -232,8 +232,8 @@ def _find_angles(
     laser: LaserLog, params: dict[str, str], given: LaserOptions, warnings: list[str]
 ) -> Float:
     """(C, 2) first angle and step in radians of each of the laser's configs, as declared."""
-    kind, n, configs = laser.kind, laser.n_readings, list(laser.configs)
-    angles = np.array([config[:2] for config in configs])
+    kind, n = laser.kind, laser.n_readings
+    angles = np.array([config[:2] for config in laser.configs])
     if kind in WITHOUT_ANGLES:
         fov = given.fov
         degrees = _param(params, f"laser_{_position(kind, params)}_laser_fov")
@@ -244,14 +244,6 @@ def _find_angles(
     elif given.fov is not None:
         text = "its lines declare their angles: the given field of view is not used"
         warnings.append(f"{kind}: {text}")
-    for config in configs:
-        fov = n * config.angle_step  # or one step less: both are in use
-        if config.field_of_view and abs(fov - config.field_of_view) > 3.0 * config.angle_step:
-            warnings.append(
-                f"{kind}: {n} readings {np.degrees(config.angle_step):.3g} deg apart are not the "
-                f"declared field of view of {np.degrees(config.field_of_view):.4g} deg"
-            )
-            break
     return angles
 
 

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,8 +46,7 @@ _OVERFLOW = 81.91  # m: a value that SICK lasers report for no return
 _ALTERNATIVE = "write a bag or a recording folder instead"
 
 
-@dataclass(frozen=True)
-class LaserFormat:
+class LaserFormat(NamedTuple):
     """Line format of one laser's scans.
 
     Attributes:
@@ -59,21 +58,6 @@ class LaserFormat:
     kind: str
     no_return: float
     unusable: float
-
-
-@dataclass(frozen=True, eq=False)
-class LogFormat:
-    """Line formats of a recording.
-
-    Attributes:
-        lasers: one or two.
-        scan_angles: (T, 2) first angle and step of each scan.
-        params: PARAM lines.
-    """
-
-    lasers: tuple[LaserFormat, ...]
-    scan_angles: Float
-    params: dict[str, str]
 
 
 def write_log(recording: Recording, path: Path, overwrite: bool = True) -> list[str]:  # noqa: ARG001
@@ -90,18 +74,20 @@ def write_log(recording: Recording, path: Path, overwrite: bool = True) -> list[
     """
     form = _choose_format(recording)
     with write_atomically(path) as file:
-        for line in _format_lines(recording, form):
+        for line in _format_lines(recording, *form):
             file.write(line.encode("ascii"))
     if recording.beam_time is None:
         return []
     return ["beam times are left out: CARMEN logs cannot hold them"]
 
 
-def _format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
+def _format_lines(
+    recording: Recording, lasers: list[LaserFormat], angles: Float, params: dict[str, str]
+) -> Iterator[str]:
     """The lines of a log with line ends: for every scan its odometry, then the scan."""
     yield "# written by stillmap\n"
     first = int(recording.stamp_ns[0])
-    for name, value in form.params.items():
+    for name, value in params.items():
         yield f"PARAM {name} {value} {format_seconds(first)} {_HOST} {format_seconds(0)}\n"
     T_odom_base = recording.T_odom_base
     if T_odom_base is not None:
@@ -115,13 +101,13 @@ def _format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
         if T_odom_base is not None:
             yield f"ODOM {_format_pose(base[t])} 0 0 0 {times}"
             poses = f"{_format_pose(laser[t])} {_format_pose(base[t])} "
-        sensor = form.lasers[recording.sensor[t]]
+        sensor = lasers[recording.sensor[t]]
         ranges = laser_scan.beam_ranges(recording, t, sensor.no_return)
         readings = _format_readings(ranges, sensor)
         if sensor.kind in _HALF_CIRCLE:
             yield f"{sensor.kind} {readings} {poses}{times}"
             continue
-        header = _format_header(form.scan_angles[t], int(counts[t]), sensor)
+        header = _format_header(angles[t], int(counts[t]), sensor)
         velocities = "0 0 0 0 0 " if poses else ""
         yield f"{sensor.kind} {header} {readings} 0 {poses}{velocities}{times}"
 
@@ -141,7 +127,8 @@ def _format_pose(pose: Float) -> str:
     return " ".join(f"{value:.6f}" for value in pose.tolist())
 
 
-def _choose_format(recording: Recording) -> LogFormat:
+def _choose_format(recording: Recording) -> tuple[list[LaserFormat], Float, dict[str, str]]:
+    """Line formats of one or two lasers, first angle and step (T, 2) of each scan, PARAM lines."""
     n_lasers = len(recording.T_base_sensor)
     counts = np.diff(recording.offset)
     for number in range(n_lasers):
@@ -164,7 +151,7 @@ def _choose_format(recording: Recording) -> LogFormat:
         lasers.append(LaserFormat(kinds[number], no_return, _unusable_reading(recording, number)))
         x, y, theta = se2.parameters(recording.T_base_sensor[number]).tolist()
         params |= _extrinsics_params(kinds[number], _POSITIONS[number], x, y, theta)
-    return LogFormat(tuple(lasers), angles, params)
+    return lasers, angles, params
 
 
 def _require_one_count(counts: Int64) -> None:

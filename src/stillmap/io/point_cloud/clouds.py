@@ -16,7 +16,7 @@ from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
-from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
+from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords, explain_failure
 from stillmap.io.point_cloud.table import Clock, convert_times, detect_clock
 from stillmap.io.text_lines import list_files, stamps_from_names, strip_extension
 from stillmap.io.trajectory import MAX_TRANSLATION, embed_in_3d
@@ -115,15 +115,16 @@ def build_recording(
     Raises:
         InputError: no cloud can be read, or a library is missing.
     """
-    window, skipped, lost = TimeWindow(context.options), SkippedRecords(), list[str]()
-    scans = _ScanBuilder(sources, notes.warnings, context, window)
     known = [source.stamp_ns for source in sources if source.stamp_ns is not None]
-    wanted = dict(zip(known, window.select_all(np.array(known, np.int64)).tolist(), strict=True))
+    window = TimeWindow(context.options, min(known, default=None))
+    scans, skipped = _ScanBuilder(known, notes.warnings, context, window), SkippedRecords()
+    lost: list[str] = []
     for number, source in enumerate(sources):
-        if source.stamp_ns is not None and not wanted[source.stamp_ns]:
+        if source.stamp_ns is not None and not window.select(source.stamp_ns):
             continue
         try:
-            cloud = _read_source(source)
+            with explain_failure(source.name):
+                cloud = source.read()
             if single and not len(cloud.points):
                 raise InputError("holds no points", where=str(notes.path))
             scans.add(number, source.stamp_ns, cloud)
@@ -150,27 +151,18 @@ def reject(file: Path, what: str) -> Cloud:
     raise InputError(what, where=str(file))
 
 
-def _read_source(source: CloudSource) -> Cloud:
-    try:
-        return source.read()
-    except MemoryError:
-        raise InputError("does not fit into memory", where=source.name) from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=source.name) from error
-
-
 class _ScanBuilder:
     """Collects clouds; the first one decides whether points have times."""
 
     def __init__(
         self,
-        sources: Sequence[CloudSource],
+        stamps: Sequence[int],
         warnings: list[str],
         context: ReadContext,
         window: TimeWindow,
     ) -> None:
         self._warnings, self._scratch, self._window = warnings, context.scratch, window
-        self._period = _median_period(sources)
+        self._period = _median_period(stamps)
         self._builder: RecordingBuilder | None = None
         self._clock: Clock | None = None
         self._poses: list[Float | None] = []
@@ -225,9 +217,8 @@ class _ScanBuilder:
         return np.stack(poses)
 
 
-def _median_period(sources: Sequence[CloudSource]) -> float | None:
+def _median_period(stamps: Sequence[int]) -> float | None:
     """Median time between stamps in seconds; None: unknown."""
-    stamps = [source.stamp_ns for source in sources if source.stamp_ns is not None]
     if len(stamps) < 2:
         return None
     return float(np.median(np.diff(np.sort(np.array(stamps, np.int64))))) / 1e9
