@@ -6,7 +6,6 @@ from PIL import Image
 
 from stillmap.io import read
 from stillmap.io.rgbd import T_BASE_CAMERA
-from stillmap.prepare.options import ReadOptions
 
 W, H = 320, 240
 DEPTH = (292.5, 160.0, 120.0, 0.0, 0.0)  # focal length, centre, metres to the right and down
@@ -81,15 +80,6 @@ def test_where_depth_is_laid_over_both_are_one(tmp_path):
     assert camera.K[0, 0] == DEPTH[0]
     np.testing.assert_array_equal(camera.T_base_camera, T_BASE_CAMERA)
     assert len(found.source.warnings) == 1  # no times
-
-
-def test_who_gives_cameras_knows(tmp_path):
-    folder = write(tmp_path, BESIDE)
-    file = folder / "cameras.toml"
-    file.write_text("[color]\nfx = 260.0\nfy = 260.0\ncx = 160.0\ncy = 120.0\n")
-    found = read(folder, ReadOptions(cameras=str(file)))
-    assert found.images.cameras[0].K[0, 0] == 260.0
-    np.testing.assert_array_equal(found.images.cameras[0].T_base_camera, T_BASE_CAMERA)
 
 
 @pytest.mark.parametrize("spoilt", ["grey", "damaged", "flat"])
