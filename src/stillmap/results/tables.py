@@ -46,7 +46,7 @@ def make_table(result: MappedPlace, name: TableName) -> "pyarrow.Table":
 
 
 def _beam_schema(poses: Float) -> "pyarrow.Schema":
-    """Names and types of the columns of a beam; see `_beam_columns`. `poses` (T, D+1, D+1)."""
+    """Names and types of the columns of a beam; see `_iter_beams`. `poses` (T, D+1, D+1)."""
     arrow = import_module("pyarrow")
     # 32 bits do not hold positions far from the origin to the millimetre
     is_far = np.abs(poses[:, :-1, -1]).max(initial=0.0) > FAR
