@@ -71,8 +71,8 @@ class Parser(argparse.ArgumentParser):
 
     def _reject(self, unknown: list[str]) -> None:
         if unknown:
-            flag = unknown[0].partition("=")[0]
-            hint = _suggest(flag, self.flags()) if flag.startswith("-") else ""
+            meant = closest_match(unknown[0].partition("=")[0], self.flags())
+            hint = f"did you mean '{meant}'?" if meant else ""
             self.error(f"unrecognized arguments: {' '.join(unknown)}", hint)
 
     def _knows(self, word: str) -> bool:
@@ -85,11 +85,6 @@ def _flags(words: list[str]) -> Iterable[str]:
     """The words that can only be long flags."""
     end = min(words.index(stop) if stop in words else len(words) for stop in ("--", "--ros-args"))
     return (word for word in words[:end] if word.startswith("--") and " " not in word)
-
-
-def _suggest(word: str, known: Iterable[str]) -> str:
-    meant = closest_match(word, known)
-    return f"did you mean '{meant}'?" if meant else ""
 
 
 COMMANDS = {

@@ -23,7 +23,7 @@ _SENSOR_NOTES = (
 
 def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
-    source = recording.source
+    source, times = recording.source, recording.beam_time
     notes = to_jsonable(source.to_dict())
     return {
         "dimension": recording.dimension,
@@ -34,7 +34,9 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
         "part": notes.get("part") or {},
-        "beam_times_s": _extremes(recording.beam_time),
+        "beam_times_s": [float(times.min()), float(times.max())]
+        if times is not None and len(times)
+        else None,
         "spin": None if source.spin is None else source.spin.direction,
         "odometry": _summarize_odometry(recording, source.odometry),
         "recorded_poses": _summarize_path(recording.T_recorded_base),
@@ -93,13 +95,6 @@ def _summarize_time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
     }
 
 
-def _extremes(values: NDArray[np.float32] | None) -> list[float] | None:
-    """The least and the greatest of the values."""
-    if values is None or not len(values):
-        return None
-    return [float(values.min()), float(values.max())]
-
-
 def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
     T = recording.T_odom_base
     if T is None:
@@ -138,7 +133,6 @@ def _summarize_images(recording: Recording) -> dict[str, Any] | None:
     from stillmap.mesh.views import usable_images  # takes long to load
 
     used, left_out = usable_images(recording)
-    taken = np.bincount(images.camera, minlength=len(images.cameras))
     return {
         "count": len(images),
         "usable": int(used.sum()),
@@ -146,14 +140,14 @@ def _summarize_images(recording: Recording) -> dict[str, Any] | None:
         "cameras": [
             {
                 "name": camera.name,
-                "count": int(n),
+                "count": int(np.sum(images.camera == number)),
                 "usable": int(used[images.camera == number].sum()),
                 "width": camera.width,
                 "height": camera.height,
                 "calibrated": camera.K is not None,
                 "placed": camera.T_base_camera is not None,
             }
-            for number, (camera, n) in enumerate(zip(images.cameras, taken, strict=True))
+            for number, camera in enumerate(images.cameras)
         ],
     }
 

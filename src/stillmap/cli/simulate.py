@@ -109,24 +109,18 @@ def run(args: argparse.Namespace) -> int:
     output = Path(args.output)
     with make_parents(output):
         counts = _simulate(scene, args, output)
-    summary: dict[str, Any] = {
-        "output": str(output),
-        "files": list_files(output),
-        "scene": scene.name,
-    }
-    summary |= {key: sum(count[key] for count in counts) for key in ("beams", "hits", "dynamic")}
-    is_rig = scene.rig.tilts  # both lasers scan at the same time
-    summary["scans"] = counts[0]["scans"] if is_rig else sum(count["scans"] for count in counts)
-    if args.sessions is not None:
-        summary["sessions"] = counts
+    keys = ("beams", "hits", "dynamic", "scans")
+    total = {key: sum(count[key] for count in counts) for key in keys}
+    if scene.rig.tilts:  # both lasers scan at the same time
+        total["scans"] = counts[0]["scans"]
     if not args.quiet:
-        share = 100 * summary["dynamic"] / max(summary["hits"], 1)
-        say(
-            f"wrote {output}: {scene.name}, {summary['scans']} scans, {summary['beams']} beams, "
-            f"{share:.1f} % of the hits on movers"
-        )
+        share = 100 * total["dynamic"] / max(total["hits"], 1)
+        size = f"{total['scans']} scans, {total['beams']} beams"
+        say(f"wrote {output}: {scene.name}, {size}, {share:.1f} % of the hits on movers")
     if args.json:
-        print_json(summary)
+        sessions = {} if args.sessions is None else {"sessions": counts}
+        summary = {"output": str(output), "files": list_files(output), "scene": scene.name}
+        print_json({**summary, **total, **sessions})
     return 0
 
 
@@ -152,11 +146,9 @@ def _simulate(scene: "Scene", args: argparse.Namespace, output: Path) -> list[di
     with show_share(args.quiet, "simulating") as progress:
         if is_rig:
             rig = simulate_rig(scene, args.seed, progress, workplace(output))
-        else:
-            made = simulate(scene, args.seed, progress, workplace(output))
-    if is_rig:
-        simulator.write_rig(rig, output, overwrite=args.overwrite)
-        return [simulator.count_beams(part) for part in (rig.horizontal, rig.tilting)]
+            simulator.write_rig(rig, output, overwrite=args.overwrite)
+            return [simulator.count_beams(part) for part in (rig.horizontal, rig.tilting)]
+        made = simulate(scene, args.seed, progress, workplace(output))
     simulator.write_simulation(made, output, format=args.format, overwrite=args.overwrite)
     return [simulator.count_beams(made)]
 
