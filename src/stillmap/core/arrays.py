@@ -21,10 +21,17 @@ from numpy.typing import DTypeLike, NDArray
 def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
     """Write named arrays. Equal arrays give equal files: dates in the archive are fixed."""
     # maps compress to a tenth; levels above 1 take three times as long for a few percent
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                _write_array(file, array)
+    with path.open("wb") as whole:
+        archive = zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+        try:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    _write_array(file, array)
+        except BaseException:
+            # close() would fail on the half-written array and hide the error
+            archive.fp = None
+            raise
+        archive.close()
 
 
 def _write_array(file: Any, array: "Writable") -> None:
