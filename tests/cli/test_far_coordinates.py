@@ -61,7 +61,7 @@ def test_clouds_keep_the_millimetre(call, mapped, tmp_path):
         assert (done.returncode, done.stderr) == (0, "")
     las = laspy.read(tmp_path / "a.las")
     assert np.abs(las.header.offsets - UTM).max() < 50.0
-    columns = next(pcd.read_columns(pcd.read_header(tmp_path / "a.pcd").layout, ["x", "y", "z"]))
+    columns = next(pcd.read_columns(pcd.read_header(tmp_path / "a.pcd")[0], ["x", "y", "z"]))
     for found in (np.asarray(las.xyz), np.stack(columns, axis=1)):
         assert found.dtype == np.float64
         assert found.shape == points.shape
