@@ -72,19 +72,6 @@ def test_a_robot_that_is_elsewhere_is_not_found(hall, first):
         assert "lost" in update.doubts
 
 
-@pytest.mark.slow
-def test_a_crowd_does_not_lose_it(hall):
-    simulation = hall.simulate(202, crowd={"people": 80})
-    found = [
-        hall.error(update, simulation, k)[0]
-        for k, update, _ in run(hall, simulation, range(200))
-        if "lost" not in update.doubts
-    ]
-    assert len(found) > 150
-    assert max(found) < 0.2
-    assert np.mean(found) < 0.06
-
-
 def test_a_robot_that_is_carried_is_found_again(hall):
     robot = {"scans": 220, "carried_at": 0.4, "carried_time": 5.0}
     simulation = hall.simulate(203, crowd={"people": 5}, robot=robot)
