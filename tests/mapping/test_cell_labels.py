@@ -57,10 +57,3 @@ def test_a_cell_whose_beams_movers_explain_is_less_of_an_obstacle():
     explained, stays = updated(before, after, share=0.5)
     assert explained == pytest.approx(0.05 / 4.0)
     assert stays == pytest.approx(0.05)
-
-
-def test_cells_of_another_step_are_refused():
-    histories = course(np.array([[1, 1]]), True)
-    other = CellProbabilities(np.array([[2, 2]]), np.zeros(1, np.float32), 0.2)
-    with pytest.raises(ValueError, match="occupied"):
-        update_occupancy(None, None, None, None, histories, other)

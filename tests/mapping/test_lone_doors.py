@@ -97,12 +97,6 @@ def test_beams_on_it_are_static_as_far_as_it_may_have_moved():
     assert np.median(result.p_static[on]) == pytest.approx(1.0 - found.p_moved, abs=0.05)
 
 
-def test_it_is_left_out_where_all_doors_are_to_be_shut():
-    result, _ = built(FREE, "shut")
-    (found,) = result.doors
-    assert (shown(result, found.open_cells) < 0.5).all()
-
-
 def test_the_side_of_a_box_is_no_door():
     result, _ = built(BOX)
     assert not result.doors
@@ -128,10 +122,14 @@ def test_a_leaf_that_beams_passed_before_is_a_door_that_moved():
     assert not result.objects
 
 
-def test_it_is_left_out_where_all_doors_are_to_be_open():
-    result, _ = built((), "open", shut_from=SHUT_FROM)
+@pytest.mark.parametrize(
+    ("leaf", "state", "since", "position"),
+    [(FREE, "shut", None, "open"), ((), "open", SHUT_FROM, "shut")],
+)
+def test_it_is_left_out_where_all_doors_are_to_be_otherwise(leaf, state, since, position):
+    result, _ = built(leaf, state, since)
     (found,) = result.doors
-    assert (shown(result, found.shut_cells) < 0.5).all()
+    assert (shown(result, getattr(found, f"{position}_cells")) < 0.5).all()
 
 
 def test_a_leaf_that_was_shut_all_the_time_stays_as_it_is():

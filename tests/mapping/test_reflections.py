@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import stillmap
 from stillmap.core.config import override
 from stillmap.mapping.mirrors import Mirror
-from stillmap.mapping.reflections import find_mirrors, find_reflections, remove_reflections
+from stillmap.mapping.reflections import find_mirrors, remove_reflections
 from stillmap.sim import Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.planar import MIRRORED
 from stillmap.sim.walls import box
@@ -102,17 +102,6 @@ def test_mirrors_are_where_they_are() -> None:
     for mirror in mirrors:
         ends = true.reshape(-1, 2, 2) @ mirror.normal - mirror.distance
         assert np.abs(ends).max(axis=1).min() < 0.06
-    found = find_reflections(run.recording, run.truth.T_world_base, mirrors)
-    np.testing.assert_array_equal(
-        found, np.logical_or.reduce([find(run, mirror) for mirror in mirrors])
-    )
-
-
-def find(run: Simulation, mirror: Mirror) -> NDArray[np.bool_]:
-    recording, beams = run.recording, np.arange(run.recording.n_beams)
-    T = recording.T_map_sensor(run.truth.T_world_base)[recording.scans_of(beams)]
-    ends = recording.end_points(beams, run.truth.T_world_base)
-    return mirror.find_crossing(T[:, :2, 2], ends)
 
 
 def test_a_crossing_beam_comes_from_the_front_and_ends_behind() -> None:

@@ -102,9 +102,3 @@ def test_nothing_is_found_in_an_empty_map():
     floor = make_map(FLOOR)
     assert search_alignments(empty, floor) == []
     assert propose_alignments(floor, empty) == []
-
-
-def test_the_search_gives_the_same_twice():
-    place, session = make_map(FLOOR), make_map(WINGS, inside=[(0.4, 0.4, 5.6, 5.6)])
-    first, second = (search_alignments(place, session) for _ in range(2))
-    np.testing.assert_array_equal(np.array(first), np.array(second))

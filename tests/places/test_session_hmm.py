@@ -62,11 +62,6 @@ def test_the_path_is_the_most_probable_history():
         assert tuple(path) == best
 
 
-def test_one_session_alone_shows_no_change():
-    found = estimate_states(np.array([[5.0], [-5.0]]), np.array([0.7, 0.2, 0.1]))
-    np.testing.assert_array_equal(found.p_changing, 0.0)
-
-
 def test_sessions_that_saw_nothing_say_nothing():
     weights = np.array([0.7, 0.2, 0.1])
     seen = estimate_states(np.array([[5.0, -5.0]]), weights)
