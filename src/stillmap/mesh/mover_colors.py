@@ -21,7 +21,7 @@ from stillmap.mesh.inputs import (
     boxes_at,
     occlusion_probability,
 )
-from stillmap.mesh.place import CANDIDATES, Background, ViewAssignment, resolve_assignment
+from stillmap.mesh.place import Background, ViewAssignment, resolve_assignment
 from stillmap.mesh.reconstruction import IMAGE_WINDOW, ObjectShape
 from stillmap.mesh.returns import DynamicReturns
 from stillmap.mesh.texture import GRAY, TexturedMesh, TextureSampler, avoid_gray, sample_bilinear
@@ -75,8 +75,8 @@ def assign_object_views(
         `T_camera_map` is T_camera_object.
     """
     mesh, _ = subdivide(shape.mesh, _MAX_FACE_EDGE)
-    candidates = Candidates.empty(len(mesh), CANDIDATES)
-    visible, own = np.zeros(len(mesh), np.bool_), list[View]()
+    candidates = Candidates.empty(len(mesh))
+    own = list[View]()
     others = [one for one in boxes if one.box.object_id != shape.id]
     seconds = times_in_view(shape.frame.box, background.views, start_ns)
     for number, (view, now) in enumerate(zip(background.views, seconds.tolist(), strict=True)):
@@ -103,9 +103,8 @@ def assign_object_views(
         if not shape.rigid:  # people change their shape
             utility -= away / IMAGE_WINDOW
         candidates.add(len(own), faces, utility, p_free)
-        visible[faces] = True
         own.append(moved)
-    assignment = resolve_assignment(mesh, candidates, visible)
+    assignment = resolve_assignment(mesh, candidates)
     areas = mesh.areas()
     if areas[assignment.view >= 0].sum() < _MIN_TEXTURED_SHARE * areas.sum():
         assignment = replace(assignment, view=np.full_like(assignment.view, NONE))

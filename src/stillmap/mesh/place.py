@@ -34,7 +34,6 @@ from stillmap.mesh.visibility import (
     render_depth,
 )
 
-CANDIDATES = 6  # views compared for each face
 SEAM_COST = 1.0  # e-folds of resolution where two images meet
 _P_UNOBSERVED = 0.9  # that an image shows static surface where no beam tells
 _MAX_COLOR_DIFFERENCE = 40.0  # of 442, from the median color of a face's candidates
@@ -88,8 +87,7 @@ def assign_views(
     if views:
         mesh, _ = subdivide(mesh, partial(max_edge_at, views))
     areas = mesh.areas()
-    candidates = Candidates.empty(len(mesh), min(CANDIDATES, max(len(views), 1)))
-    visible = np.zeros(len(mesh), np.bool_)
+    candidates = Candidates.empty(len(mesh))
 
     def evaluate(view: View) -> tuple[Index, Float, Float]:
         pixels = find_visible_faces(mesh, view)
@@ -99,7 +97,6 @@ def assign_views(
 
     for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
         candidates.add(number, faces, view_utility(p, pixels, areas[faces]), p)
-        visible[faces] = True
         tell(number + 1, len(views))
     gains, read = np.ones((len(views), 3)), partial(read_color_image, inputs.images)
     if views:
@@ -107,7 +104,7 @@ def assign_views(
         gains = estimate_gains(candidates.view, colors, len(views))
         colors *= gains[candidates.view]  # NaN where there is no view
         candidates = reject_inconsistent_views(candidates, colors, _MAX_COLOR_DIFFERENCE)
-    return resolve_assignment(mesh, candidates, visible), gains
+    return resolve_assignment(mesh, candidates), gains
 
 
 def max_edge_at(views: Sequence[View], points: Float) -> Float:
@@ -121,18 +118,12 @@ def max_edge_at(views: Sequence[View], points: Float) -> Float:
     return np.asarray(np.maximum(_MAX_FACE_EDGE, wide), np.float64)
 
 
-def resolve_assignment(mesh: Mesh, candidates: Candidates, visible: Bool) -> ViewAssignment:
-    """Selects the view of each of F faces from its candidates, with few seams.
-
-    Args:
-        mesh: F faces.
-        candidates: the best views of each.
-        visible: (F,) whether any view shows it.
-    """
+def resolve_assignment(mesh: Mesh, candidates: Candidates) -> ViewAssignment:
+    """Selects the view of each face of a mesh from its candidates, with few seams."""
     view = select_views(candidates, mesh.adjacent_faces(), SEAM_COST)
     p_static = np.where(candidates.view == view[:, None], candidates.p_static, 0.0).max(axis=1)
     p_static = np.where(view >= 0, p_static, 0.0).astype(np.float32)
-    return ViewAssignment(mesh, view, p_static, visible)
+    return ViewAssignment(mesh, view, p_static, candidates.visible)
 
 
 def p_unoccluded(mesh: Mesh, faces: Index, view: View, inputs: MeshInputs) -> Float:

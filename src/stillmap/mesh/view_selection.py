@@ -19,6 +19,7 @@ from stillmap.mesh.triangle_mesh import Image, Mesh
 from stillmap.mesh.views import View, read_color_image
 
 NONE = -1
+_CANDIDATES = 6  # views compared for each face
 MIN_P_VISIBLE = 0.6  # probability below which an image does not texture a face
 _OCCLUSION_WEIGHT = 10.0  # e-folds of resolution per e-fold of that probability
 _ITERATIONS = 20  # of belief propagation
@@ -41,24 +42,28 @@ class Candidates(NamedTuple):
         view: (F, K) number of the view; -1: none.
         utility: (F, K) e-folds of resolution; -inf where there is none.
         p_static: (F, K) probability that the image shows static surface only.
+        visible: (F,) whether any image shows the face at all.
     """
 
     view: Int32
     utility: Float32
     p_static: Float32
+    visible: Bool
 
     @classmethod
-    def empty(cls, n_faces: int, k: int) -> "Candidates":
+    def empty(cls, n_faces: int, k: int = _CANDIDATES) -> "Candidates":
         """Candidates of faces that no image shows."""
         shape = n_faces, k
         return cls(
             np.full(shape, NONE, np.int32),
             np.full(shape, -np.inf, np.float32),
             np.zeros(shape, np.float32),
+            np.zeros(n_faces, np.bool_),
         )
 
     def add(self, view: int, faces: Index, utility: Float, p_static: Float) -> None:
         """Inserts a view of faces (n,) by its utility (n,); the worst candidate drops out."""
+        self.visible[faces] = True
         better = utility > self.utility[faces, -1]
         faces = faces[better]
         row = np.arange(len(faces))[:, None]
@@ -167,10 +172,10 @@ def reject_inconsistent_views(
     off[tested] = np.linalg.norm(colors[tested] - median, axis=2)
     majority = 2 * (off < 0.5 * max_difference).sum(axis=1) > known
     out = majority[:, None] & (off > max_difference)
-    return Candidates(
-        np.where(out, np.int32(NONE), candidates.view),
-        np.where(out, np.float32(-np.inf), candidates.utility),
-        np.where(out, np.float32(0.0), candidates.p_static),
+    return candidates._replace(
+        view=np.where(out, np.int32(NONE), candidates.view),
+        utility=np.where(out, np.float32(-np.inf), candidates.utility),
+        p_static=np.where(out, np.float32(0.0), candidates.p_static),
     )
 
 
