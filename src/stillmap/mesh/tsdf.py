@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
 
 import stillmap._core as _core
 from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
@@ -98,7 +98,10 @@ def choose_resolution(
     noise = float(np.median(noises))
     wanted = float(np.clip(max(spacing, _NOISE_RATIO * noise), _MIN_VOXEL, _MAX_VOXEL))
     voxel = voxel_size or max(wanted, min_voxel_size(recording, poses))
-    wide, scene_range = _MAX_SPACING * voxel, float(np.median(np.concatenate(ranges)))
+    sampled = np.arange(0, recording.n_beams, max(recording.n_beams // _SAMPLED_BEAMS, 1))
+    hits = recording.points[sampled[recording.hit[sampled]]]
+    scene_range = float(np.nanmedian(np.linalg.norm(hits, axis=1)))
+    wide = _MAX_SPACING * voxel
     return voxel, scene_range, wide / scene_range if wide >= 2.0 * spacing else 0.0
 
 
@@ -125,6 +128,7 @@ def min_voxel_size(recording: Recording, poses: Float) -> float:
 
 _MIN_P_STATIC = 0.8  # product over a triangle's beams; below, a beam has little but its prior
 TILE = 64  # voxels along a tile, whole blocks
+_UNKNOWN = -1e6  # m, below all distances: a cube with one such corner has too large a step
 _MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
 _TRUNCATION = 3.0, 2.0  # voxels in front of a surface and behind it
 _MIN_AREA = 0.05  # m2: smaller connected components are dropped
@@ -239,8 +243,11 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     first = [int(c) * TILE for c in tile]
     metres, weight = volume.dense(first, [TILE + 1] * 3)
     known = weight > min_weight
-    corners = sliding_window_view(np.where(known, metres, np.nan), (2, 2, 2))
-    low, high = corners.min(axis=(3, 4, 5)), corners.max(axis=(3, 4, 5))
+    values = np.where(known, metres, np.float32(_UNKNOWN))
+    low, high = (
+        reduce(values, 2, origin=-1)[:-1, :-1, :-1]
+        for reduce in (ndimage.minimum_filter, ndimage.maximum_filter)
+    )
     cubes = (low < 0.0) & (high >= 0.0) & (high - low <= _MAX_STEP * volume.voxel)
     if not cubes.any():
         return Mesh.empty()
