@@ -1,15 +1,12 @@
 """Changes between sessions: cells that are otherwise from a session on, grouped to objects; among
 them door leaves, which are straight, hinged, and beside a gap in a wall that they could shut."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.array_types import Bool, Float, Index
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.places.place_states import PlaceStates, are_near
@@ -127,51 +124,6 @@ class PlaceChange(ShortRepr):
     cells: Index
     from_low: Float | None = None
     from_high: Float | None = None
-
-
-def change_records(
-    changes: Sequence[PlaceChange], names: Sequence[str], frame: LocalFrame
-) -> list[dict[str, object]]:
-    """The entries of `changes.json`.
-
-    Args:
-        changes: in the order of time.
-        names: of the sessions, in the order of time.
-        frame: of the changes, in the map frame.
-    """
-    out = []
-    for number, change in enumerate(changes):
-        record: dict[str, object] = {
-            "id": number,
-            "kind": change.kind,
-            "box": _corners(change.low, change.high, frame),
-        }
-        if change.from_low is not None and change.from_high is not None:
-            record["from_box"] = _corners(change.from_low, change.from_high, frame)
-        record["between"] = [names[change.before], names[change.after]]
-        record["probability"] = round(change.probability, 4)
-        out.append(record)
-    return out
-
-
-def _corners(low: Float, high: Float, frame: LocalFrame) -> list[float]:
-    """x0, y0, x1, y1, and in 3D z0, z1, in the map frame."""
-    low, high = frame.points_to_map(low), frame.points_to_map(high)
-    plane = [*low[:2], *high[:2]]
-    return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]
-
-
-def change_cells(
-    changes: Sequence[PlaceChange], place: PlaceStates, frame: LocalFrame
-) -> dict[str, NDArray[np.generic]]:
-    """The cells of all changes: `change` (K,) the entry of `changes.json`, and `xy` (K, 2) or `xyz`
-    (K, 3), the centres of the cells in metres."""
-    cells = [change.cells for change in changes]
-    number = np.repeat(np.arange(len(changes), dtype=np.int32), [len(of) for of in cells])
-    of = np.concatenate([np.zeros(0, np.intp), *cells])
-    D = place.cells.shape[1]
-    centres = frame.points_to_map((place.cells[of] + 0.5) * place.resolution)
-    return {"change": number, "xyz"[:D]: centres}
 
 
 _MIN_PROBABILITY = 0.5  # that a cell changed

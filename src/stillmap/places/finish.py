@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
-from stillmap.core.array_types import Float32
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
@@ -22,7 +23,7 @@ from stillmap.em import OccupancyMap
 from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
-from stillmap.places.changes import PlaceChange, change_cells, change_records, detect_place_changes
+from stillmap.places.changes import PlaceChange, detect_place_changes
 from stillmap.places.grow import estimate_planar
 from stillmap.places.keyframes import join_keyframes
 from stillmap.places.objects import write_objects
@@ -34,7 +35,7 @@ from stillmap.places.place_map import (
     make_place_map,
     show_state,
 )
-from stillmap.places.place_states import estimate_place
+from stillmap.places.place_states import PlaceStates, estimate_place
 from stillmap.places.store import (
     TIES,
     read_beam_cells,
@@ -257,8 +258,8 @@ def _write_place_files(folder: Path, result: PlaceResult) -> None:
     write_joined_beams(folder / "beams", homes)
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))
-    write_json(folder / CHANGES, change_records(result.changes, names, frame))
-    write_npz(folder / "changes.npz", change_cells(result.changes, result.shown.place, frame))
+    write_json(folder / CHANGES, _change_records(result.changes, names, frame))
+    write_npz(folder / "changes.npz", _change_cells(result.changes, result.shown.place, frame))
     write_npz(folder / STATES, changed_cell_table(result.planar, names, frame))
     write_ties(folder / TIES, place.ties, place.dimension)
 
@@ -312,3 +313,48 @@ def _placed_record(placed: PlacedSession, first_scan: int, frame: LocalFrame) ->
         "first_scan": first_scan,
         "scans": len(stamp_ns),
     }
+
+
+def _change_records(
+    changes: Sequence[PlaceChange], names: Sequence[str], frame: LocalFrame
+) -> list[dict[str, object]]:
+    """The entries of `changes.json`.
+
+    Args:
+        changes: in the order of time.
+        names: of the sessions, in the order of time.
+        frame: of the changes, in the map frame.
+    """
+    out = []
+    for number, change in enumerate(changes):
+        record: dict[str, object] = {
+            "id": number,
+            "kind": change.kind,
+            "box": _corners(change.low, change.high, frame),
+        }
+        if change.from_low is not None and change.from_high is not None:
+            record["from_box"] = _corners(change.from_low, change.from_high, frame)
+        record["between"] = [names[change.before], names[change.after]]
+        record["probability"] = round(change.probability, 4)
+        out.append(record)
+    return out
+
+
+def _corners(low: Float, high: Float, frame: LocalFrame) -> list[float]:
+    """x0, y0, x1, y1, and in 3D z0, z1, in the map frame."""
+    low, high = frame.points_to_map(low), frame.points_to_map(high)
+    plane = [*low[:2], *high[:2]]
+    return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]
+
+
+def _change_cells(
+    changes: Sequence[PlaceChange], place: PlaceStates, frame: LocalFrame
+) -> dict[str, NDArray[np.generic]]:
+    """The cells of all changes: `change` (K,) the entry of `changes.json`, and `xy` (K, 2) or `xyz`
+    (K, 3), the centres of the cells in metres."""
+    cells = [change.cells for change in changes]
+    number = np.repeat(np.arange(len(changes), dtype=np.int32), [len(of) for of in cells])
+    of = np.concatenate([np.zeros(0, np.intp), *cells])
+    D = place.cells.shape[1]
+    centres = frame.points_to_map((place.cells[of] + 0.5) * place.resolution)
+    return {"change": number, "xyz"[:D]: centres}

@@ -13,7 +13,14 @@ from stillmap.core import se2, se3
 from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.keyframes import Keyframes, Session
-from stillmap.places.place import Place, PlacedSession, Tie, optimize_nodes, update_evidence
+from stillmap.places.place import (
+    Place,
+    PlacedSession,
+    Tie,
+    estimate_covariance,
+    optimize_nodes,
+    update_evidence,
+)
 from stillmap.places.place_states import PlaceStates, estimate_place, measure_overlap
 from stillmap.places.placement import (
     CORRECTED_STD,
@@ -21,7 +28,6 @@ from stillmap.places.placement import (
     KeyframeMatch,
     Placement,
     Verdict,
-    estimate_covariance,
     find_placement,
     match_sessions,
     match_sweeps,

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from stillmap.core import se2
+from stillmap.core import se2, se3
 from stillmap.core.array_types import Bool, Float
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
@@ -17,6 +17,7 @@ from stillmap.slam.local_map import propagate_corrections
 from stillmap.slam.pose_graph import Constraint
 
 MAX_CHI2 = {2: 16.0, 3: 25.0}  # above it the graph rejects a constraint between sessions
+_INDEPENDENT = 0.3  # share of a match that is evidence of its own: neighbours share their errors
 _LEVER = 2.0  # m at which an error of the heading counts like one of the position
 
 
@@ -252,3 +253,34 @@ def _measure(placed: PlacedSession, place: Place, limit: float, threads: int) ->
     if session.dimension == 3:
         evidence = measure_evidence(session.keyframes, poses, place.voxel_size, threads)
     return replace(placed, evidence=evidence, planar_evidence=planar, measured_at=poses)
+
+
+def estimate_covariance(placed: PlacedSession, ties: Sequence[Tie]) -> Float:
+    """Covariance of the alignment of a session, at its first scan and in its frame.
+
+    (3, 3) of x, y, heading; (6, 6) of translation and rotation vector in 3D.
+    """
+    poses = se2.inverse(placed.session.node_poses[0]) @ placed.session.node_poses
+    return combine_covariances(
+        poses[[tie.second_node for tie in ties]], [tie.covariance for tie in ties]
+    )
+
+
+def combine_covariances(poses: Float, covariances: Sequence[Float]) -> Float:
+    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance."""
+    D = poses.shape[-1] - 1
+    information: Float = 1e-9 * np.eye(3 * (D - 1))
+    for pose, covariance in zip(poses, covariances, strict=True):
+        J = _alignment_jacobian(pose)
+        information = information + _INDEPENDENT * J.T @ np.linalg.solve(covariance, J)
+    return np.asarray(np.linalg.inv(information).astype(np.float64))
+
+
+def _alignment_jacobian(pose: Float) -> Float:
+    """Of the error of a pose, in its own frame, by that of the frame it is given in."""
+    if pose.shape[-1] == 4:
+        return se3.adjoint(se2.inverse(pose))
+    R, (x, y) = pose[:2, :2].T, pose[:2, 2]
+    J = np.eye(3)
+    J[:2, :2], J[:2, 2] = R, R @ [-y, x]
+    return J

@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core import se2, se3
+from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.alignment import Hypothesis, propose_alignments, spread_evenly
 from stillmap.places.evidence import measure_evidence
 from stillmap.places.keyframes import Keyframes, Session, join_keyframes
-from stillmap.places.place import PlacedSession, Tie
+from stillmap.places.place import PlacedSession, combine_covariances
 from stillmap.places.surface_map import is_determined, make_surface_map
 from stillmap.slam import loop_candidates, loop_verification, scan_matching
 from stillmap.slam.lidar_odometry import LidarOdometry
@@ -229,7 +229,6 @@ _STRONG_AGREEING, _STRONG_CONFLICT, _STRONG_RIVAL = 1000, 0.06, 0.3
 _MIN_FITTING = 5  # nodes
 # std along the least known direction (m), and of the heading (rad), up to which a session is placed
 _MAX_STD, _MAX_HEADING_STD = 0.05, math.radians(0.5)
-_INDEPENDENT = 0.3  # share of a match that is evidence of its own: neighbours share their errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,39 +376,10 @@ def placement_std(placement: Placement, session: Session) -> tuple[float, float]
     fits = [m for of in placement.matches.values() for m in of if m.verdict is Verdict.FITS]
     poses = session.planar.poses[session.planar.nodes[[m.node for m in fits]]]
     x, y = poses[:, :2, 2].mean(axis=0).tolist()
-    covariance = _combine(
+    covariance = combine_covariances(
         se2.inverse(se2.matrix(x, y, 0.0)) @ poses, [match.closure.covariance for match in fits]
     )
     return (
         float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])),
         float(np.sqrt(covariance[2, 2])),
     )
-
-
-def estimate_covariance(placed: PlacedSession, ties: Sequence[Tie]) -> Float:
-    """Covariance of the alignment of a session, at its first scan and in its frame.
-
-    (3, 3) of x, y, heading; (6, 6) of translation and rotation vector in 3D.
-    """
-    poses = se2.inverse(placed.session.node_poses[0]) @ placed.session.node_poses
-    return _combine(poses[[tie.second_node for tie in ties]], [tie.covariance for tie in ties])
-
-
-def _combine(poses: Float, covariances: Sequence[Float]) -> Float:
-    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance."""
-    D = poses.shape[-1] - 1
-    information: Float = 1e-9 * np.eye(3 * (D - 1))
-    for pose, covariance in zip(poses, covariances, strict=True):
-        J = _alignment_jacobian(pose)
-        information = information + _INDEPENDENT * J.T @ np.linalg.solve(covariance, J)
-    return np.asarray(np.linalg.inv(information).astype(np.float64))
-
-
-def _alignment_jacobian(pose: Float) -> Float:
-    """Of the error of a pose, in its own frame, by that of the frame it is given in."""
-    if pose.shape[-1] == 4:
-        return se3.adjoint(se2.inverse(pose))
-    R, (x, y) = pose[:2, :2].T, pose[:2, 2]
-    J = np.eye(3)
-    J[:2, :2], J[:2, 2] = R, R @ [-y, x]
-    return J
