@@ -68,20 +68,14 @@ def test_slider_shows_map_scans_and_changes_of_a_session(window):
     assert node(window, "/robot/robot").position == pytest.approx([2.0, 0.2, 0.0])
 
 
-def test_map_is_as_of_the_session(window):
-    seen = []
+def test_map_and_boxes_are_those_of_the_session(window):
+    shown, seen = {}, []
     for session in range(4):
         window.show_session(session)
         seen.append(chair_color(window))
-    assert seen == [(255, 255, 255), KIND_COLORS["appeared"], (0, 0, 0), (0, 0, 0)]
-
-
-def test_boxes_are_those_of_what_changed_since_the_session_before(window):
-    shown = {}
-    for session in range(4):
-        window.show_session(session)
         shown[session] = [k for k in KIND_COLORS if node(window, f"/changes/{k}").visible]
     assert shown == {0: [], 1: ["appeared"], 2: ["moved", "door"], 3: ["gone"]}
+    assert seen == [(255, 255, 255), KIND_COLORS["appeared"], (0, 0, 0), (0, 0, 0)]
     window.show_session(2)
     moved = node(window, "/changes/moved").points
     # the four sides of both boxes, the arrow and its head
@@ -93,12 +87,10 @@ def test_boxes_are_those_of_what_changed_since_the_session_before(window):
 
 
 def test_objects_are_those_of_the_session(window):
-    window.show_session(1)
-    window.show(2)
-    assert window._objects._drawn == [1]
-    window.show_session(0)
-    window.show(2)
-    assert window._objects._drawn == [0]
+    for session in (1, 0):
+        window.show_session(session)
+        window.show(2)
+        assert window._objects._drawn == [session]
 
 
 def test_objects_of_another_session_at_the_same_time_are_not_shown(tmp_path, opened):

@@ -60,23 +60,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "learned": result.learned,
         **({LOCAL_ORIGIN: result.frame.origin.tolist()} if result.frame.is_shifted else {}),
         "calibration": _calibration(result.calibration),
-        "doubts": {
-            "odometry_disagrees": result.doubts.odometry_faults,
-            "found_by_wider_search": result.doubts.widened,
-            "carried_before": result.doubts.breaks,
-            "beside_the_map_from": result.doubts.unconnected,
-            "ambiguous": result.doubts.ambiguous,
-            "length_unknown": [
-                {
-                    **{"first": one.first, "last": one.last},
-                    **{
-                        "metres": round(one.metres, MILLIMETRES),
-                        "std": round(one.std, MILLIMETRES),
-                    },
-                }
-                for one in result.doubts.bare_stretches
-            ],
-        },
+        "doubts": _doubts(result),
         "changes": [_change(one) for one in result.changes],
         "doors": [_door(one) | {"p_moved": round(one.p_moved, 4)} for one in result.doors],
         "loops": {
@@ -87,6 +71,26 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
     }
     plain: dict[str, Any] = to_jsonable(record)
     return plain
+
+
+def _doubts(result: MappingResult) -> dict[str, Any]:
+    doubts = result.doubts
+    return {
+        "odometry_disagrees": doubts.odometry_faults,
+        "found_by_wider_search": doubts.widened,
+        "carried_before": doubts.breaks,
+        "beside_the_map_from": doubts.unconnected,
+        "ambiguous": doubts.ambiguous,
+        "length_unknown": [
+            {
+                "first": one.first,
+                "last": one.last,
+                "metres": round(one.metres, MILLIMETRES),
+                "std": round(one.std, MILLIMETRES),
+            }
+            for one in doubts.bare_stretches
+        ],
+    }
 
 
 def quality_record(quality: Quality) -> dict[str, float | None]:
