@@ -82,7 +82,7 @@ def write_keepout_mask(folder: Path, keepout: NDArray[np.bool_], occupancy: Grid
     """
     known = ~np.isnan(np.asarray(occupancy.p_occupied))
     pixels = np.where(keepout, _OCCUPIED, np.where(known, _FREE, _UNKNOWN)).astype(np.uint8)
-    _write_pgm(folder / "keepout.pgm", pixels, _identity)
+    _write_pgm(folder / "keepout.pgm", pixels, np.asarray)
     thresholds = FREE_THRESH, OCCUPIED_THRESH
     _write_yaml(folder / "keepout.yaml", "keepout.pgm", "trinary", occupancy, thresholds)
 
@@ -94,12 +94,8 @@ def write_speed_mask(folder: Path, values: NDArray[np.uint8], occupancy: GridMap
     darker is larger, and a grey level is finer than a step of the values.
     """
     pixels = np.rint(255 * (1 - np.arange(101) / 100)).astype(np.uint8)[values]
-    _write_pgm(folder / "speed.pgm", pixels, _identity)
+    _write_pgm(folder / "speed.pgm", pixels, np.asarray)
     _write_yaml(folder / "speed.yaml", "speed.pgm", "scale", occupancy, (0.0, 1.0))
-
-
-def _identity(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    return pixels
 
 
 def _write_yaml(

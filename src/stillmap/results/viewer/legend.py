@@ -2,7 +2,6 @@
 
 import html
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from stillmap.results.colors import (
     BLUE,
@@ -67,30 +66,22 @@ _RAMP = "width:4em;height:.8em;background:linear-gradient(90deg,"
 _IDS = color_by_id([0, 1, 2]).tolist()
 
 
-class Row(NamedTuple):
-    """Meaning of colors in a layer: style of a swatch for each color, and words."""
-
-    layer: str
-    style: str
-    colors: Sequence[Sequence[int]]
-    words: str
-
-
-_ROWS = [
-    Row("Map", _AREA, [(0, 0, 0), (255, 255, 255), UNKNOWN], "map: occupied, free, unknown"),
-    Row("Surface", _LINE, [(150, 150, 150)], "static surface"),
-    Row(DYNAMIC, _DOT, [ORANGE], "dynamic points"),
-    Row("Robot", _LINE, [BLUE], "trajectory of the robot"),
-    Row("Beams", _DOT, [ORANGE, GREY, BLUE], "beams of this scan: dynamic, undecided, static"),
-    Row("Rays", _LINE, [TEAL], "rays from the sensor"),
-    Row("Objects", _FRAME, _IDS, "moving objects (click on one)"),
-    Row("Object tracks", _LINE, _IDS, "tracks of moving objects"),
-    Row("Sessions", _LINE, _IDS, "trajectories of the sessions"),
-    Row("Changes", _FRAME, [KIND_COLORS["appeared"]], "A: appeared"),
-    Row("Changes", _FRAME, [KIND_COLORS["gone"]], "G: gone"),
-    Row("Changes", _FRAME, [KIND_COLORS["moved"]], "M: moved, from where the arrow begins"),
-    Row("Changes", _FRAME, [KIND_COLORS["door"]], "D: door swung"),
-    Row(
+# meaning of colors in a layer: style of a swatch for each color, and words
+_ROWS: list[tuple[str, str, Sequence[Sequence[int]], str]] = [
+    ("Map", _AREA, [(0, 0, 0), (255, 255, 255), UNKNOWN], "map: occupied, free, unknown"),
+    ("Surface", _LINE, [(150, 150, 150)], "static surface"),
+    (DYNAMIC, _DOT, [ORANGE], "dynamic points"),
+    ("Robot", _LINE, [BLUE], "trajectory of the robot"),
+    ("Beams", _DOT, [ORANGE, GREY, BLUE], "beams of this scan: dynamic, undecided, static"),
+    ("Rays", _LINE, [TEAL], "rays from the sensor"),
+    ("Objects", _FRAME, _IDS, "moving objects (click on one)"),
+    ("Object tracks", _LINE, _IDS, "tracks of moving objects"),
+    ("Sessions", _LINE, _IDS, "trajectories of the sessions"),
+    ("Changes", _FRAME, [KIND_COLORS["appeared"]], "A: appeared"),
+    ("Changes", _FRAME, [KIND_COLORS["gone"]], "G: gone"),
+    ("Changes", _FRAME, [KIND_COLORS["moved"]], "M: moved, from where the arrow begins"),
+    ("Changes", _FRAME, [KIND_COLORS["door"]], "D: door swung"),
+    (
         "Changes",
         _AREA,
         [KIND_COLORS["appeared"], KIND_COLORS["gone"]],
@@ -114,10 +105,9 @@ def legend_html(layers: Layers, coloring: str) -> str:
     stops = HEIGHT_COLORS if coloring == HEIGHT else STATIC_COLORS
     ramp = _RAMP + ",".join(f"rgb{color}" for color in stops) + ")"
     rows = [_row([] if coloring == PICTURES else [ramp], words)] if layers.is_shown(STATIC) else []
-    for one in _ROWS:
-        if layers.is_shown(one.layer):
-            swatches = [f"{one.style}rgb{tuple(color)}" for color in one.colors]
-            rows.append(_row(swatches, one.words))
+    for layer, style, colors, meaning in _ROWS:
+        if layers.is_shown(layer):
+            rows.append(_row([f"{style}rgb{tuple(color)}" for color in colors], meaning))
     return f'<div style="{TEXT_STYLE};padding-top:.6em">{"".join(rows)}</div>'
 
 
