@@ -241,12 +241,9 @@ def validate_camera(camera: Camera) -> str:
 def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Images:
     """The images of one camera, from stamps (ns) and files in any order."""
     ordered = sorted(files, key=lambda pair: pair[0])
-    return Images(
-        stamp_ns=np.array([stamp for stamp, _ in ordered], np.int64),
-        camera=np.zeros(len(ordered), np.int32),
-        cameras=(camera,),
-        load=lambda image: read_image(ordered[image][1]),
-    )
+    stamp_ns = np.array([stamp for stamp, _ in ordered], np.int64)
+    number = np.zeros(len(ordered), np.int32)
+    return Images(stamp_ns, number, (camera,), lambda image: read_image(ordered[image][1]))
 
 
 def merge_images(parts: Sequence[Images]) -> Images:
@@ -282,12 +279,8 @@ def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Im
             cameras[number] = given.apply_to(camera)
             stamp_ns[images.camera == number] += given.time_offset_ns
     order = np.argsort(stamp_ns, kind="stable")
-    return Images(
-        stamp_ns[order],
-        images.camera[order],
-        tuple(cameras),
-        lambda image: images.read(int(order[image])),
-    )
+    numbers, stamp_ns = images.camera[order], stamp_ns[order]
+    return Images(stamp_ns, numbers, tuple(cameras), lambda k: images.read(int(order[k])))
 
 
 def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) -> Images:

@@ -96,14 +96,8 @@ def _list_scenes(path: Path) -> Frames:
     if not depth:
         raise InputError("holds no frame-NNNNNN.depth.png", where=str(path))
     warnings = [f"no file holds stamps: images are taken {_RATE} per second, by their numbers"]
-    return Frames(
-        SCENES,
-        depth,
-        sorted(by_kind["color"]),
-        [_read_pose(file) for _, file in depth],
-        _read_intrinsics(path, warnings),
-        warnings,
-    )
+    color, poses = sorted(by_kind["color"]), [_read_pose(file) for _, file in depth]
+    return Frames(SCENES, depth, color, poses, _read_intrinsics(path, warnings), warnings)
 
 
 def _nominal_ns(number: int) -> int:
@@ -152,14 +146,8 @@ def _list_tum(path: Path) -> Frames:
     has_color = (path / "rgb.txt").is_file()
     color = _read_list(path / "rgb.txt", warnings) if has_color else []
     stamps = np.array([stamp for stamp, _ in depth], np.int64)
-    return Frames(
-        TUM,
-        depth,
-        color,
-        _interpolate_tum_poses(path / "groundtruth.txt", stamps, warnings),
-        _read_intrinsics(path, warnings),
-        warnings,
-    )
+    poses = _interpolate_tum_poses(path / "groundtruth.txt", stamps, warnings)
+    return Frames(TUM, depth, color, poses, _read_intrinsics(path, warnings), warnings)
 
 
 def _read_list(path: Path, warnings: list[str]) -> list[tuple[int, Path]]:

@@ -62,11 +62,8 @@ def calibrate_color_camera(
     T = np.eye(4)
     T[:2, 3] = -tx, -ty
     assert depth.T_base_camera is not None
-    camera = replace(
-        depth,
-        K=np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]),
-        T_base_camera=depth.T_base_camera @ T,
-    )
+    K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+    camera = replace(depth, K=K, T_base_camera=depth.T_base_camera @ T)
     warning = (
         "depth is not registered to color: calibrated from edges, the color camera sits "
         f"{1e3 * np.hypot(tx, ty):.0f} mm beside the depth camera and has a focal length of "

@@ -112,16 +112,12 @@ def _read_images(path: Path, header: _Header) -> Images | None:
         return None
     stamp_ns = np.array(read_array(path / "image_stamp_ns.npy", (header.images,), np.int64))
     camera = np.array(read_array(path / "image_camera.npy", (header.images,), np.int32))
-    cameras = tuple(
-        replace(
-            Camera(**vars(noted)),
-            K=_matrix(noted.K, 3),
-            distortion=np.array(noted.distortion, np.float64),
-            T_base_camera=_matrix(noted.T_base_camera, 4),
-        )
-        for noted in header.cameras
-    )
-    return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
+    cameras = []
+    for noted in header.cameras:
+        K, T = _matrix(noted.K, 3), _matrix(noted.T_base_camera, 4)
+        distortion, own = np.array(noted.distortion, np.float64), Camera(**vars(noted))
+        cameras.append(replace(own, K=K, distortion=distortion, T_base_camera=T))
+    return Images(stamp_ns, camera, tuple(cameras), partial(_load_image, path / _IMAGES))
 
 
 def _matrix(rows: Any, n: int) -> Float | None:

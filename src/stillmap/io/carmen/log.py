@@ -227,16 +227,10 @@ class LaserLog:
 
     def raw(self, directions: list[Float], max_range: float | None = None) -> RawLaser:
         """The usable scans with the directions (n, 2) of each config."""
-        return RawLaser(
-            self.kind,
-            self.stamp_ns,
-            np.frombuffer(self.ranges, np.float32),
-            self._start,
-            self._shape,
-            list(directions),
-            max_range=max_range,
-            sample=maxsize,
-        )
+        ranges = np.frombuffer(self.ranges, np.float32)
+        scans = self.stamp_ns, ranges, self._start, self._shape
+        known = list(directions)
+        return RawLaser(self.kind, *scans, known, max_range=max_range, sample=maxsize)
 
 
 class CarmenLog:

@@ -123,15 +123,9 @@ class IndexedBag:
 def _channel(connection: Any) -> Channel:
     ext = connection.ext
     is_text = connection.msgdef.format == MessageDefinitionFormat.MSG
-    channel = Channel(
-        connection.id,
-        connection.topic,
-        connection.msgtype,
-        "ros1",
-        connection.msgcount,
-        connection.digest,
-        connection.msgdef.data if is_text else "",
-    )
+    names = connection.id, connection.topic, connection.msgtype, "ros1"
+    definition = connection.msgdef.data if is_text else ""
+    channel = Channel(*names, connection.msgcount, connection.digest, definition)
     if isinstance(ext, ConnectionExtRosbag2):
         qos = tuple(ext.offered_qos_profiles)
         latched = any(q.durability == QosDurability.TRANSIENT_LOCAL for q in qos)

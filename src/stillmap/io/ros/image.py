@@ -109,12 +109,9 @@ def _apply_camera_info(camera: Camera, info: Any) -> Camera:
     else:
         model = str(info.distortion_model)
     usable = K.shape == (9,) and np.isfinite(K).all() and K[0] > 0.0
-    return replace(
-        camera,
-        K=K.reshape(3, 3) if usable else None,
-        model=model,
-        distortion=D if np.isfinite(D).all() else _NONE,
-    )
+    distortion = D if np.isfinite(D).all() else _NONE
+    matrix = K.reshape(3, 3) if usable else None
+    return replace(camera, K=matrix, model=model, distortion=distortion)
 
 
 def _rectify_pose(T: Float | None, R: Float) -> Float | None:
