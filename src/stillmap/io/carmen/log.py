@@ -21,9 +21,10 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from sys import maxsize
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float, Int64
 from stillmap.core.timestamps import longest_non_decreasing, parse_ns
@@ -229,7 +230,7 @@ class LaserLog:
         """The usable scans with the directions (n, 2) of each config."""
         ranges = np.frombuffer(self.ranges, np.float32)
         scans = self.stamp_ns, ranges, self._start, self._shape
-        known = list(directions)
+        known: list[NDArray[np.floating[Any]]] = list(directions)
         return RawLaser(self.kind, *scans, known, max_range=max_range, sample=maxsize)
 
 
