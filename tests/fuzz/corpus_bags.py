@@ -47,15 +47,9 @@ def _camera_info(messages: Messages, stamp: int) -> tuple[str, Any]:
 
 def _multi_echo(messages: Messages, stamp: int) -> tuple[str, Any]:
     kind, echoes = "sensor_msgs/msg/MultiEchoLaserScan", [np.float32(e) for e in ([1], [])]
-    return kind, messages.make(
-        kind,
-        messages.header(stamp, "laser2"),
-        angle_increment=0.1,
-        time_increment=0.001,
-        range_min=0.1,
-        range_max=9.0,
-        ranges=[{"echoes": echo} for echo in echoes],
-    )
+    shape = {"angle_increment": 0.1, "time_increment": 0.001, "range_min": 0.1, "range_max": 9.0}
+    ranges = [{"echoes": echo} for echo in echoes]
+    return kind, messages.make(kind, messages.header(stamp, "laser2"), ranges=ranges, **shape)
 
 
 def laser_messages(messages: Messages) -> list[tuple[str, int, tuple[str, Any]]]:
@@ -126,9 +120,8 @@ def messages_of(encoding: str) -> Iterator[bytes]:
     """Messages as parts: a line with type and topic, then the content."""
     messages = Messages(encoding)
     for content in (laser_messages(messages), cloud_messages(messages)):
-        yield join_parts(
-            [
-                f"{kind} {topic}\n".encode() + messages.raw(kind, message)
-                for topic, _, (kind, message) in content
-            ]
-        )
+        yield join_parts([_with_topic(messages, *message) for message in content])
+
+
+def _with_topic(messages: Messages, topic: str, _: int, made: tuple[str, Any]) -> bytes:
+    return f"{made[0]} {topic}\n".encode() + messages.raw(*made)

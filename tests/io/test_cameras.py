@@ -13,6 +13,7 @@ from stillmap.prepare.options import ReadOptions
 
 ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 LENS = "fx = 20.0\nfy = 21\ncx = 7.5\ncy = 5.5\n"
+OF_LEFT = r"\(camera 'left' of .*cameras\.toml\)"
 AHEAD = "translation = [0.2, 0, 0.5]\nquaternion = [-0.5, 0.5, -0.5, 0.5]\n"
 
 
@@ -122,18 +123,9 @@ def test_names_of_pictures_may_be_their_times(drive, file, more):
         ("[imag_2]\n", r"there is no camera 'imag_2' \(nearest: 'image_2'; folder"),
         ("[imag_2]\nfx = 1\n", r"there is no camera 'imag_2' \(nearest: 'image_2'; folder"),
         ('[image_2]\nfolder = "left"\n', "has images in the recording"),
-        (
-            '[left]\nfolder = "missing"\n',
-            r"missing: cannot be read: No such file.*\(camera 'left' of .*cameras\.toml\)",
-        ),
-        (
-            '[left]\nfolder = "empty"\n',
-            r"empty: holds no images \(camera 'left' of .*cameras\.toml\)",
-        ),
-        (
-            '[left]\nfolder = "bad"\n',
-            r"1\.5\.png: is no image.* \(camera 'left' of .*cameras\.toml\)",
-        ),
+        ('[left]\nfolder = "missing"\n', f"missing: cannot be read: No such file.*{OF_LEFT}"),
+        ('[left]\nfolder = "empty"\n', f"empty: holds no images {OF_LEFT}"),
+        ('[left]\nfolder = "bad"\n', rf"1\.5\.png: is no image.* {OF_LEFT}"),
         ('[left]\nfolder = "left"\n', "names are no stamps .times = 'FILE' in camera 'left'"),
         ('[left]\nfolder = "left"\ntimes = "no.txt"\n', r"no\.txt: cannot be read|No such file"),
         ('[left]\nfolder = "left"\ntimes = "short.txt"\n', "has 2 stamps for 3 files"),

@@ -79,17 +79,10 @@ def test_pipe_in_a_recording(tmp_path, log, name):
         read(tmp_path / "r")
 
 
-@pytest.mark.parametrize(
-    "reader",
-    [
-        load_toml,
-        read_tum,
-        readers.read_relations,
-        readers.read_trajectory,
-        readers.read_odometry,
-        read,
-    ],
-)
+OF_SCORES = (readers.read_relations, readers.read_trajectory, readers.read_odometry)
+
+
+@pytest.mark.parametrize("reader", [load_toml, read_tum, *OF_SCORES, read])
 def test_device_without_end(tmp_path, reader):
     (tmp_path / "zero").symlink_to("/dev/zero")
     with pytest.raises(InputError, match="is no regular file"):

@@ -76,12 +76,8 @@ def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
 
 def test_even_times_are_a_step_from_beam_to_beam():
     scan = (np.arange(5) * 0.1, np.ones(5))
-    even, falling, late, uneven = (
-        [0.0, 0.01, 0.02, 0.03, 0.04],
-        [0.0, -0.01, -0.02, -0.03, -0.04],
-        [0.1, 0.11, 0.12, 0.13, 0.14],
-        [0.0, 0.01, 0.025, 0.03, 0.04],
-    )
+    even, uneven = 0.01 * np.arange(5), [0.0, 0.01, 0.025, 0.03, 0.04]
+    falling, late = -even, 0.1 + even
     one = recording([scan] * 4, beam_time=[*even, *falling, *late, *uneven])
     steps, n_uneven = laser_scan.time_increments(one)
     np.testing.assert_allclose(steps, [0.01, -0.01, 0.0, 0.0], atol=1e-8)

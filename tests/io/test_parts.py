@@ -136,11 +136,8 @@ def test_a_raw_kitti_drive_in_pieces(tmp_path):
     rng = np.random.default_rng(1)
     scans = [rng.uniform(-9.0, 9.0, (30, 4)).astype("<f4") for _ in range(20)]
     stamps = [f"2011-09-26 13:02:{25 + 0.1037 * k:012.9f}" for k in range(20)]
-    for folder, rows in (
-        (whole, range(20)),
-        (tmp_path / "a", range(9)),
-        (tmp_path / "b", range(9, 20)),
-    ):
+    spans = {whole: range(20), tmp_path / "a": range(9), tmp_path / "b": range(9, 20)}
+    for folder, rows in spans.items():
         (folder / "velodyne_points/data").mkdir(parents=True)
         for number, k in enumerate(rows):
             scans[k].tofile(folder / f"velodyne_points/data/{number:010d}.bin")

@@ -131,14 +131,9 @@ def cloud_message(
         at += np.dtype(_KINDS[kind]).itemsize
     step = step or at
     order = ">" if big else "<"
-    dtype = np.dtype(
-        {
-            "names": [name for name, _, _ in columns],
-            "formats": [order + _KINDS[kind] for _, kind, _ in columns],
-            "offsets": offsets,
-            "itemsize": step,
-        }
-    )
+    names = [name for name, _, _ in columns]
+    formats = [order + _KINDS[kind] for _, kind, _ in columns]
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
     values = np.zeros(n, dtype)
     for name, _, column in columns:
         values[name] = column
@@ -149,15 +144,7 @@ def cloud_message(
         {"name": name, "offset": o, "datatype": kind, "count": 1}
         for (name, kind, _), o in zip(columns, offsets, strict=True)
     ]
-    stated = {
-        "height": height,
-        "width": width,
-        "fields": fields,
-        "is_bigendian": big,
-        "point_step": step,
-        "row_step": width * step + padding,
-        "data": data.ravel(),
-        "is_dense": True,
-    } | changes
+    row_step = width * step + padding
     kind = "sensor_msgs/msg/PointCloud2"
-    return kind, messages.make(kind, messages.header(stamp, frame), **stated)
+    layout = height, width, fields, big, step, row_step, data.ravel(), True
+    return kind, messages.make(kind, messages.header(stamp, frame), *layout, **changes)

@@ -141,12 +141,8 @@ def raw_contents(path, messages):
 @pytest.mark.parametrize(
     ("height", "changes"),
     [
-        (1, {}),
-        (1, {"padding": 8}),
-        (1, {"row_step": 0}),
-        (1, {"big": True}),
-        (4, {"padding": 8}),
-        (4, {"big": True}),
+        *((1, {}), (1, {"padding": 8}), (1, {"row_step": 0}), (1, {"big": True})),
+        *((4, {"padding": 8}), (4, {"big": True})),
     ],
 )
 def test_points_of_clouds(bag, kind, messages, tmp_path, height, changes):
