@@ -53,8 +53,8 @@ class EveryBeamCounts(OnlineSlam):
     def _weigh(self, hits, prior):  # noqa: ARG002
         return hits
 
-    def _add_to_maps(self, beams, labelled, e, found):
-        return super()._add_to_maps(beams, labelled, np.ones_like(e), found)
+    def _add_to_maps(self, observation, e, registered):
+        return super()._add_to_maps(observation, np.ones_like(e), registered)
 
     def _label_again(self, scan):
         return np.ones(len(scan.e), np.float32)
