@@ -47,20 +47,17 @@ def perfect(simulation, state):
         if stay.contains(simulation.recording.stamp_ns[-1:])[0] == (state == "last"):
             cells = np.floor((beams.end[beams.hits_on(stay)] - low) / resolution).astype(int)
             p[cells[:, 1], cells[:, 0]] = 0.9
-    occupancy = SimpleNamespace(
-        p_occupied=p, origin=(float(low[0]), float(low[1]), 0.0), resolution=resolution
-    )
-    found = [
-        SimpleNamespace(
-            kind="came" if c.appeared else "left", appeared=c.appeared, stamp_ns=c.observed_ns,
-            x=float(c.stay.center[0]), y=float(c.stay.center[1]),
-        )
-        for c in list_true_changes(stays, beams) if c.observed_ns is not None
-    ]  # fmt: skip
-    options = SimpleNamespace(output=SimpleNamespace(map_state="last"))
-    mapping = SimpleNamespace(changes=found)
+    found = []
+    for c in list_true_changes(stays, beams):
+        if c.observed_ns is not None:
+            x, y = c.stay.center.tolist()
+            kind = {"kind": "came" if c.appeared else "left", "appeared": c.appeared}
+            found.append(SimpleNamespace(**kind, stamp_ns=c.observed_ns, x=x, y=y))
     return SimpleNamespace(
-        poses=truth.T_world_base, map=occupancy, mapping=mapping, options=options
+        poses=truth.T_world_base,
+        map=SimpleNamespace(p_occupied=p, origin=(*low.tolist(), 0.0), resolution=resolution),
+        mapping=SimpleNamespace(changes=found),
+        options=SimpleNamespace(output=SimpleNamespace(map_state="last")),
     )
 
 

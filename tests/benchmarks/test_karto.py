@@ -75,9 +75,8 @@ def test_poses_are_of_the_base_and_scans_between_follow_odometry(recording):
 def test_ranges_are_those_of_the_beams(recording):
     first, step, ranges = karto.evenly(recording)
     angles = first + step * np.arange(90)
-    points = (ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).reshape(
-        -1, 2
-    )
+    ahead = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    points = (ranges[..., None] * ahead).reshape(-1, 2)
     np.testing.assert_allclose(points[recording.hit], recording.points[recording.hit], atol=1e-4)
     np.testing.assert_array_equal(np.isnan(ranges.ravel()), ~recording.hit)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from model_objects import Model, MoverHits, Track, match_mover, score_object_models
 from model_surface import (
     GREY,
@@ -18,19 +19,10 @@ from stillmap.core.camera import Camera
 from stillmap.sim.camera import SKY
 from stillmap.sim.geometry import BOX, Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
 
-NONE = Solids(
-    np.empty((1, 0, 4)),
-    np.empty(0, np.int8),
-    np.empty((0, 2)),
-    np.empty((0, 2)),
-    np.empty(0, np.int32),
-)
-FLOOR = StaticSurfaces(
-    Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)),
-    NONE,
-    Ground(np.zeros(2), np.empty((0, 4)), 0.0),
-    None,
-)
+PAIRS = np.empty((0, 2))
+NO_SOLIDS = Solids(np.empty((1, 0, 4)), np.empty(0, np.int8), PAIRS, PAIRS, np.empty(0, np.int32))
+NO_FACES = Faces(np.empty((0, 4)), PAIRS, np.empty(0, bool))
+FLOOR = StaticSurfaces(NO_FACES, NO_SOLIDS, Ground(np.zeros(2), np.empty((0, 4)), 0.0), None)
 # 3 m above the floor, looking straight down; 4 x 3 m fill the picture
 K = np.array([[30.0, 0, 19.5], [0, 30.0, 14.5], [0, 0, 1]])
 DOWN = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
@@ -44,10 +36,8 @@ def _floor(x, y, z=0.0, n=10):
     """A square of the floor in the map frame, upwards."""
     u, v = (m.ravel() for m in np.meshgrid(np.linspace(*x, n + 1), np.linspace(*y, n + 1)))
     world = np.stack([u, v, np.full(len(u), z)], axis=1)
-    a = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    faces = np.concatenate(
-        [np.stack([a, a + 1, a + n + 2], 1), np.stack([a, a + n + 2, a + n + 1], 1)]
-    )
+    first = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
+    faces = np.concatenate([first + np.array(half) for half in ((0, 1, n + 2), (0, n + 2, n + 1))])
     return world @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3], faces.astype(np.int32)
 
 
@@ -55,9 +45,8 @@ def _pictures(mask, off=0.0):
     v, u = np.mgrid[:30, :40]
     rays = np.stack([(u - 19.5) / 30, (v - 14.5) / 30, np.ones(u.shape)])
     distance = (3.0 * np.linalg.norm(rays, axis=0) + off).astype(np.float32)
-    return TrueImages(
-        [CAMERA], np.zeros(1, np.int32), DOWN[None], lambda _: mask, lambda _: distance
-    )
+    one = np.zeros(1, np.int32)
+    return TrueImages([CAMERA], one, DOWN[None], lambda _: mask, lambda _: distance)
 
 
 def _record(vertices, faces):
@@ -103,29 +92,16 @@ def test_texture_shows_what_the_pictures_do():
 # a box of 2 x 1 x 1 m that drives along x at 1 m/s
 _POSE = np.zeros((3, 1, 4))
 _POSE[:, 0, 0] = [0.0, 1.0, 2.0]
+HALF, Z, ONE = np.array([[1.0, 0.5]]), np.array([[0.0, 1.0]]), np.zeros(1, np.int32)
 DRIVES = MovingSurfaces(
-    np.array([0, 10**9, 2 * 10**9]),
-    Solids(
-        _POSE,
-        np.array([BOX], np.int8),
-        np.array([[1.0, 0.5]]),
-        np.array([[0.0, 1.0]]),
-        np.zeros(1, np.int32),
-    ),
+    np.array([0, 10**9, 2 * 10**9]), Solids(_POSE, np.array([BOX], np.int8), HALF, Z, ONE)
 )
-_CUBE = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-_SIDES = np.array(
-    [
-        (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-        (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
-    ],
-    np.int32,
-)  # fmt: skip
 
 
 def _box(grown):
-    """The corners of a box larger than that by so much on every side, about its foot."""
-    return _CUBE * (1.0 + grown, 0.5 + grown, 0.5 + grown) + (0, 0, 0.5)
+    """Corners and sides of a box larger than that by so much on every side, about its foot."""
+    cube = trimesh.creation.box((2 + 2 * grown, 1 + 2 * grown, 1 + 2 * grown))
+    return cube.vertices + np.array([0, 0, 0.5]), cube.faces.astype(np.int32)
 
 
 def _seen_box():
@@ -141,10 +117,9 @@ def _seen_box():
 def test_a_model_that_is_too_large_is_off_by_that(grown):
     T = np.eye(4)
     T[0, 3] = 2.0  # where it is at 2 s
-    model = Model(_box(grown), _SIDES, T_MAP_WORLD @ T, 2 * 10**9, (0, 10**9), None)
+    model = Model(*_box(grown), T_MAP_WORLD @ T, 2 * 10**9, (0, 10**9), None)
     none = _pictures(np.zeros((30, 40), np.uint16))
-    tracked = {7: 0, 8: -1}
-    models = {7: (0, model), 8: (-1, model)}
+    tracked, models = {7: 0, 8: -1}, {7: (0, model), 8: (-1, model)}
     found = score_object_models(tracked, models, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
     (one,) = found.models
     assert found.nothing == 1
@@ -162,18 +137,10 @@ def test_background_on_a_mover_is_told():
     mask[:, :20] = 0
     corners = np.array([(-1.0, -0.5, 1.0), (1, -0.5, 1), (1, 0.5, 1), (-1, 0.5, 1)])
     roof = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
-    T = np.linalg.inv(DOWN)[None]
-    model = Model(
-        corners,
-        roof,
-        T_MAP_WORLD,
-        0,
-        (0, 0),
-        TextureRecord(corners, roof, np.zeros(2, np.int32), T),
-    )
-    found = score_object_models(
-        {1: 0}, {1: (0, model)}, ["car"], DRIVES, _seen_box(), _pictures(mask), T_WORLD_MAP
-    )
+    texture = TextureRecord(corners, roof, np.zeros(2, np.int32), np.linalg.inv(DOWN)[None])
+    models = {1: (0, Model(corners, roof, T_MAP_WORLD, 0, (0, 0), texture))}
+    seen = _seen_box(), _pictures(mask), T_WORLD_MAP
+    found = score_object_models({1: 0}, models, ["car"], DRIVES, *seen)
     assert found.background == pytest.approx(0.5, abs=0.01)
     assert found.models[0].textured == 1.0
 
@@ -191,13 +158,9 @@ def test_a_model_is_of_whom_the_track_was_on_then():
     assert len(track.within((-(2**62), 2**62)).xy) == 4
 
 
-SQUARE = (
-    np.array([(0.0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 1, 0)]),
-    np.array([(0, 1, 2), (0, 2, 3)], np.int32),
-)
-
-
 def test_distances_to_corners_edges_and_inside():
+    square = np.array([(0.0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 1, 0)])
+    halves = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
     points = np.array([(1.0, 0.5, 0.3), (-0.3, 0.5, 0.4), (2.3, 1.4, 0.0), (0.5, 0.5, 0.0)])
-    distances = distance_to_mesh(points, *SQUARE, 0.1)
+    distances = distance_to_mesh(points, square, halves, 0.1)
     assert np.allclose(distances, [0.3, 0.5, 0.5, 0.0])

@@ -29,11 +29,8 @@ def where():
 def thing(beams, speed=1.0):
     beams = np.sort(np.asarray(beams))
     scan = np.unique(beams // N)
-    velocity = np.tile([speed, 0.0], (len(scan), 1))
-    xy = np.zeros((len(scan), 2))
-    return MovingObject(
-        0, scan, (2e8 * scan).astype(np.int64), xy, velocity, (0.5, 0.3), beams, 1.0
-    )
+    stamps, xy = (2e8 * scan).astype(np.int64), np.zeros((len(scan), 2))
+    return MovingObject(0, scan, stamps, xy, xy + np.array([speed, 0]), (0.5, 0.3), beams, 1.0)
 
 
 def beams_of(mover, first=0, last=T):
@@ -47,11 +44,8 @@ def scores(*objects, chosen=(0, 1)):
 
 def test_a_mover_that_was_not_seen_for_a_while_is_seen_anew():
     found = find_sightings(walkers(), OFFSET, SECONDS, (0, 1), min_seconds=1.0)
-    assert [(one.mover, len(one.scans), len(one.beams)) for one in found] == [
-        (0, 40, 80),
-        (1, 20, 20),
-        (1, 7, 7),
-    ]
+    sizes = [(one.mover, len(one.scans), len(one.beams)) for one in found]
+    assert sizes == [(0, 40, 80), (1, 20, 20), (1, 7, 7)]
     assert len(find_sightings(walkers(), OFFSET, SECONDS, (0, 1))) == 2  # 7 scans are 1.4 s
 
 
@@ -62,29 +56,27 @@ def test_all_right():
     assert found.speed_error == pytest.approx(0.0, abs=1e-12)
 
 
-def test_lost():
-    found = scores(thing(beams_of(0, 0, 20)), chosen=(0,))
-    assert (found.sightings, found.whole, found.lost, found.split) == (1, 0, 1, 0)
-    assert (scores(chosen=(0,)).whole, scores(chosen=(0,)).lost) == (0, 1)
-    assert np.isnan(scores().speed_error)
+@pytest.mark.parametrize(
+    ("objects", "whole", "lost", "split", "switches"),
+    [
+        ([], 0, 1, 0, 0),
+        ([(0, 20)], 0, 1, 0, 0),
+        ([(0, 26), (26, T)], 0, 0, 1, 1),
+        ([(0, 34), (34, T)], 1, 0, 0, 1),
+    ],
+)
+def test_lost_split_and_switched(objects, whole, lost, split, switches):
+    found = scores(*(thing(beams_of(0, *scans)) for scans in objects), chosen=(0,))
+    assert found.sightings == 1
+    assert (found.whole, found.lost, found.split, found.switches) == (whole, lost, split, switches)
+    assert np.isnan(found.speed_error) == (not objects)
 
 
-def test_split_and_switched():
-    found = scores(thing(beams_of(0, 0, 26)), thing(beams_of(0, 26)), chosen=(0,))
-    assert (found.whole, found.lost, found.split, found.switches) == (0, 0, 1, 1)
-    nearly = scores(thing(beams_of(0, 0, 34)), thing(beams_of(0, 34)), chosen=(0,))
-    assert (nearly.whole, nearly.split, nearly.switches) == (1, 0, 1)
-
-
-def test_merged():
-    both = thing(np.concatenate([beams_of(0), beams_of(1)]))
-    found = scores(both)
+def test_merged_and_false():
+    found = scores(thing(np.flatnonzero(walkers() >= 0)))
     assert (found.whole, found.merged) == (0, 2)
-
-
-def test_false_objects_lie_on_what_is_static():
-    walls = np.flatnonzero(walkers() == -1)
-    found = scores(thing(beams_of(0)), thing(walls))
+    walls = thing(np.flatnonzero(walkers() == -1))  # what is static
+    found = scores(thing(beams_of(0)), walls)
     assert (found.objects, found.false) == (2, 1)
 
 

@@ -41,32 +41,19 @@ def true_changes(truth, cells):
     return found
 
 
-def score(found, truth, cells):
-    return score_changes(found, "cells", cells, truth, SESSIONS)
-
-
-def test_true_changes_score_perfectly(truth, cells):
-    scores = score(true_changes(truth, cells), truth, cells)
-    assert scores.cells > 30
-    assert scores.f1 > 0.98
-    assert scores.events > 1
-    assert scores.events_found == scores.events
-    assert scores.dates_right == 1.0
-
-
-def test_nothing_found_is_no_recall(truth, cells):
-    scores = score([], truth, cells)
-    assert scores.recall == 0.0
-    assert scores.events_found == 0
-
-
-def test_changes_of_another_place_are_spurious(truth, cells):
-    wrong = [
-        one._replace(came=one.left & False, left=cells.fixed) for one in true_changes(truth, cells)
-    ]
-    scores = score(wrong, truth, cells)
-    assert scores.recall < 0.2
-    assert scores.spurious > 0
+def test_right_none_and_spurious_changes(truth, cells):
+    right = true_changes(truth, cells)
+    elsewhere = [one._replace(came=one.left & False, left=cells.fixed) for one in right]
+    perfect, nothing, wrong = (
+        score_changes(found, "cells", cells, truth, SESSIONS) for found in (right, [], elsewhere)
+    )
+    assert perfect.cells > 30
+    assert perfect.f1 > 0.98
+    assert perfect.events_found == perfect.events > 1
+    assert perfect.dates_right == 1.0
+    assert (nothing.recall, nothing.events_found) == (0.0, 0)
+    assert wrong.recall < 0.2
+    assert wrong.spurious > 0
 
 
 def test_voxels_are_found_by_their_points_and_have_26_neighbours():

@@ -37,14 +37,8 @@ def run(*command, cwd, path=None):
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     if path is not None:
         environment["PATH"] = path
-    done = subprocess.run(
-        [str(part) for part in command],
-        cwd=cwd,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    how = {"cwd": cwd, "env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([str(part) for part in command], **how, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -60,23 +54,17 @@ def archives(tmp_path_factory):
     """What `make wheel` writes: a source archive, and a wheel built from it in isolation."""
     folder = tmp_path_factory.mktemp("archives")
     run(ROOT / "tools" / "build_wheel.sh", sys.executable, folder, cwd=folder)
-    return folder
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return sdist, wheel
 
 
-@pytest.fixture(scope="module")
-def sdist(archives):
-    (archive,) = archives.glob("*.tar.gz")
-    return archive
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def wheel(archives):
-    (archive,) = archives.glob("*.whl")
-    return archive
+    return archives[1]
 
 
-def test_source_archive_is_complete(sdist):
-    with tarfile.open(sdist) as archive:
+def test_source_archive_is_complete(archives):
+    with tarfile.open(archives[0]) as archive:
         names = [name.partition("/")[2] for name in archive.getnames()]
     assert [name for name in names if JUNK.search(f"/{name}")] == []
     for folder in ("src", "cpp", "tests"):
@@ -89,8 +77,8 @@ def test_source_archive_is_complete(sdist):
 
 def test_wheel_holds_only_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
-    assert len(names) == len(set(names))
     info = "-".join(wheel.name.split("-")[:2]) + ".dist-info"
+    assert len(names) == len(set(names))
     assert {name.split("/")[0] for name in names} == {"stillmap", info}
     assert [name for name in names if name.endswith(".pyi")] == ["stillmap/_core.pyi"]
     assert len([name for name in names if name.endswith(".so")]) == 1

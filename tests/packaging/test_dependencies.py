@@ -55,16 +55,12 @@ def imports(path):
             yield from ((name.name, default) for name in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             yield from ((f"{node.module}.{name.name}", default) for name in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_extra"):
+        elif isinstance(node, ast.Call) and re.search(
+            r"import_(extra|module)$", ast.unparse(node.func)
+        ):
             group = next((k.value.value for k in node.keywords if k.arg == "group"), "io")
             if isinstance(node.args[0], ast.Constant):
                 yield node.args[0].value, group
-        elif (
-            isinstance(node, ast.Call)
-            and ast.unparse(node.func).endswith("import_module")
-            and isinstance(node.args[0], ast.Constant)
-        ):
-            yield node.args[0].value, "io"
 
 
 def is_foreign(module):

@@ -34,19 +34,16 @@ def test_every_module_is_installed_and_nothing_else(installed):
     source = REPOSITORY / "src"
     modules = {str(path.relative_to(source)) for path in source.rglob("*.py")}
     own = {file for file in installed if ".dist-info/" not in file}
-    extra = sorted(own - modules)
     assert modules <= own
-    kinds = ("results/report/templates/*.j2", "results/report/templates/*.js", "sim/worlds/*.toml")
-    data = {
-        str(path.relative_to(source)) for kind in kinds for path in (source / "stillmap").glob(kind)
-    }
+    kinds = ("report/templates/*.j2", "report/templates/*.js", "worlds/*.toml")
+    paths = (path for kind in kinds for path in (source / "stillmap").glob(f"*/{kind}"))
+    data = {str(path.relative_to(source)) for path in paths}
     assert data <= own
     assert {"report", "hall"} <= {Path(file).name.partition(".")[0] for file in data}
-    extra = [file for file in extra if file not in data]
-    assert len(extra) == 4
-    assert extra[0].endswith("bin/stillmap")
-    assert re.fullmatch(r"stillmap/_core\.[\w-]+\.so", extra[1])
-    assert extra[2:] == ["stillmap/_core.pyi", "stillmap/py.typed"]
+    script, kernels, *extra = sorted(own - modules - data)
+    assert script.endswith("bin/stillmap")
+    assert re.fullmatch(r"stillmap/_core\.[\w-]+\.so", kernels)
+    assert extra == ["stillmap/_core.pyi", "stillmap/py.typed"]
 
 
 def parameters(function):

@@ -25,13 +25,9 @@ def test_citation_and_changelog_name_the_version():
 
 def lacking(path, python="python3", **environment):
     """Exit status and lines of tools/require.sh with the programs of `path` alone."""
-    done = subprocess.run(
-        ["/bin/sh", ROOT / "tools" / "require.sh", python],
-        env={"PATH": str(path), **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ["/bin/sh", ROOT / "tools" / "require.sh", python]
+    environment = {"PATH": str(path), **environment}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.stdout == ""
     return done.returncode, done.stderr.splitlines()
 
@@ -59,18 +55,13 @@ def test_require_passes_here():
     assert lacking(os.environ["PATH"], sys.executable, CXX="g++") == (0, [])
 
 
-def test_no_python_and_no_compiler(programs):
-    status, lines = lacking(programs())
-    assert status == 1
-    assert lines == [
-        "stillmap: python3 is missing: apt install python3 python3-venv python3-dev",
-        "stillmap: g++ is missing: apt install g++",
-    ]
-
-
-def test_named_compiler_is_the_one_looked_for(programs):
-    _, lines = lacking(programs(), CXX="nocompiler -m64")
-    assert lines[-1] == "stillmap: nocompiler is missing: apt install g++"
+@pytest.mark.parametrize(
+    ("named", "compiler"), [({}, "g++"), ({"CXX": "nocompiler -m64"}, "nocompiler")]
+)
+def test_no_python_and_no_compiler(programs, named, compiler):
+    no_python = "stillmap: python3 is missing: apt install python3 python3-venv python3-dev"
+    no_compiler = f"stillmap: {compiler} is missing: apt install g++"
+    assert lacking(programs(), **named) == (1, [no_python, no_compiler])
 
 
 @needs_compiler

@@ -38,21 +38,9 @@ def resources_of(html):
     return [*parser.addresses, *styles_of(" ".join(re.findall(r"<style.*?</style>", html, re.S)))]
 
 
-def test_pages_load_nothing_from_outside():
-    pages = sorted(SITE.rglob("*.html"))
-    assert pages
-    outside = {
-        f"{page.relative_to(SITE)}: {address}"
-        for page in pages
-        for address in resources_of(page.read_text("utf-8"))
-        if OUTSIDE.match(address)
-    }
-    assert outside == set()
-
-
-def test_styles_load_nothing_from_outside():
-    sheets = sorted(SITE.rglob("*.css"))
-    assert sheets
-    for sheet in sheets:
-        outside = [a for a in styles_of(sheet.read_text("utf-8")) if OUTSIDE.match(a)]
-        assert outside == [], sheet
+@pytest.mark.parametrize(("kind", "find"), [("html", resources_of), ("css", styles_of)])
+def test_nothing_is_loaded_from_outside(kind, find):
+    files = sorted(SITE.rglob(f"*.{kind}"))
+    assert files
+    for file in files:
+        assert not [a for a in find(file.read_text("utf-8")) if OUTSIDE.match(a)], file

@@ -61,15 +61,10 @@ def test_packages_that_are_not_installed_are_faults(supply):
     assert next(supply.check_licenses(["no-such-package"]))[2] == "unknown, or not installed"
 
 
-def test_constraints_name_all_that_is_needed(supply, constraints):
+def test_constraints_name_all_that_is_needed_within_its_bounds(supply, constraints):
     assert set(supply.find_dependencies((*supply.RUNTIME, "test"))) <= constraints.keys()
-
-
-def test_constraints_are_within_the_bounds(supply, constraints):
     groups = supply.PROJECT["optional-dependencies"]
-    texts = [*supply.PROJECT["dependencies"]]
-    for name in (*supply.RUNTIME, "test"):
-        texts += groups[name]
-    for one in map(Requirement, texts):
+    more = (text for name in (*supply.RUNTIME, "test") for text in groups[name])
+    for one in map(Requirement, [*supply.PROJECT["dependencies"], *more]):
         if one.name != "stillmap" and (one.marker is None or one.marker.evaluate()):
             assert one.specifier.contains(constraints[supply.normalize(one.name)]), str(one)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.core.source import RangeRule, SensorNotes
 from stillmap.prepare.plausibility import (
     leave_out_far_returns,
@@ -16,15 +16,8 @@ from stillmap.prepare.plausibility import (
 def scan(lengths, hit, dimension=2):
     points = np.zeros((len(lengths), dimension), np.float32)
     points[:, 1] = lengths
-    return Recording(
-        stamp_ns=np.zeros(1, np.int64),
-        offset=np.array([0, len(lengths)]),
-        points=points,
-        hit=np.array(hit, bool),
-        sensor=np.zeros(1, np.int32),
-        T_base_sensor=np.eye(dimension + 1)[None],
-        T_odom_base=None,
-    )
+    stamp, offset = np.zeros(1, np.int64), np.array([0, len(points)])
+    return of_one_sensor(stamp, offset, points, np.array(hit, bool))
 
 
 @pytest.mark.parametrize(
@@ -53,17 +46,14 @@ def test_mapped_range(dimension, cell, max_range, reach):
 )
 def test_what_is_said_of_the_laser_is_believed(how, stated):
     recording = scan([5.0], [True])
-    recording.source.sensors = [
-        SensorNotes(ranges=RangeRule(250.0, how, "unusable", "", None, "", 0.0))
-    ]
+    rule = RangeRule(250.0, how, "unusable", "", None, "", 0.0)
+    recording.source.sensors = [SensorNotes(ranges=rule)]
     assert stated_max_range(recording) == stated
 
 
 def test_what_is_near_stays():
     near = scan([1.0, 81.9, np.nan, 99.9], [True, True, False, False])
-    found, notes = leave_out_far_returns(near, 0.05)
-    assert found is near
-    assert notes == []
+    assert leave_out_far_returns(near, 0.05) == (near, [])
 
 
 @pytest.mark.parametrize(("dimension", "far"), [(2, 101.0), (3, 1300.0)])

@@ -17,14 +17,12 @@ from stillmap.sim.walls import box
 
 
 def drive(name, seed=0, **changes):
-    usual: dict[str, dict[str, object]] = {"robot": {"scans": 250}, "crowd": {"people": 8}}
-    sections = {**usual, **{k: {**usual.get(k, {}), **v} for k, v in changes.items()}}
-    return simulate(scene_by_name(name, sections), seed)
+    usual = scene_by_name(name, {"robot": {"scans": 250}, "crowd": {"people": 8}})
+    return simulate(override(usual, changes), seed)
 
 
 def find(run):
-    odometry = run.recording.T_odom_base
-    return find_floor_returns(run.recording, odometry)
+    return find_floor_returns(run.recording, run.recording.T_odom_base)
 
 
 ROUGH = {"bump_rate": 2.5, "bump_pitch": 0.06}
@@ -92,8 +90,10 @@ def test_floor_starts_with_a_low_p_static():
     e = em.initial_p_static(run.recording, "stillmap", options)
     assert (e[floor] < 0.05).mean() > 0.75
     assert (e[run.truth.static] == np.float32(options.prior)).mean() > 0.995
-    for estimator, usual in (("paper", options.prior), ("hit-ratio", 1.0)):
-        e = em.initial_p_static(run.recording, estimator, options)
-        assert (e == np.float32(usual)).all()
-    e = em.initial_p_static(run.recording.without_odometry(), "stillmap", options)
-    assert (e == np.float32(options.prior)).all()
+    blind = run.recording.without_odometry()
+    for recording, estimator, usual in (
+        (run.recording, "paper", options.prior),
+        (run.recording, "hit-ratio", 1.0),
+        (blind, "stillmap", options.prior),
+    ):
+        assert (em.initial_p_static(recording, estimator, options) == np.float32(usual)).all()

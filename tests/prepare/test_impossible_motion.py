@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.prepare.plausibility import leave_out_far_scans, remove_leaps
 
 T, N = 20, 3
@@ -15,16 +15,9 @@ def drive(dimension=2):
     """A robot that drives 0.2 m per scan of three beams, ten scans a second."""
     pose = np.tile(np.eye(dimension + 1), (T, 1, 1))
     pose[:, 0, -1] = 0.2 * np.arange(T)
-    points = np.ones((T * N, dimension), np.float32)
-    return Recording(
-        stamp_ns=np.arange(T) * 100_000_000,
-        offset=np.arange(T + 1) * N,
-        points=points,
-        hit=np.ones(T * N, bool),
-        sensor=np.zeros(T, np.int32),
-        T_base_sensor=np.eye(dimension + 1)[None],
-        T_odom_base=pose,
-    )
+    points, hit = np.ones((T * N, dimension), np.float32), np.ones(T * N, bool)
+    flat = of_one_sensor(np.arange(T) * 100_000_000, np.arange(T + 1) * N, points, hit)
+    return dataclasses.replace(flat, T_odom_base=pose)
 
 
 def shifted(recording, first, metres):

@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 import stillmap
+from stillmap.core import se2
 
 FAR = 1e7  # m, of poses and odometry
 MAX_SCANS = 10
@@ -70,12 +71,10 @@ class OddRecording:
         return int(self.directions.shape[1])
 
     def __repr__(self):
-        return (
-            f"<{self.dimension}D as {self.form}, scans of {list(self.counts)} beams, stamps "
-            f"{list(self.stamp_ns)}, odometry {self.odometry is not None}, poses "
-            f"{self.poses is not None}, times {self.beam_time is not None}, "
-            f"{' '.join(self.words)}, then {self.then}, {self.notes}>"
-        )
+        given = [n for n in ("odometry", "poses", "beam_time") if getattr(self, n) is not None]
+        counts, stamps = self.counts.tolist(), self.stamp_ns.tolist()
+        what = f"{self.dimension}D as {self.form}, scans of {counts} beams, stamps {stamps}"
+        return f"<{what}, with {given}, {self.words}, then {self.then}, {self.notes}>"
 
 
 @st.composite
@@ -115,9 +114,7 @@ def _drive(rng, D, counts, form):
     scan = np.repeat(np.arange(T), counts)
     turn = rng.uniform(-0.1, 0.1) * np.arange(T)
     poses = np.tile(np.eye(D + 1), (T, 1, 1))
-    poses[:, :2, :2] = np.stack(
-        [np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)], axis=-1
-    ).reshape(T, 2, 2)
+    poses[:, :2, :2] = se2.matrix(0.0 * turn, 0.0 * turn, turn)[:, :2, :2]
     poses[:, 0, D] = rng.uniform(0.0, 0.15) * np.arange(T)
     if D == 2:
         number = np.arange(M) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -203,16 +200,14 @@ def to_recording(one):
         n = int(one.counts[0])
         angles = np.arctan2(*one.directions[:n, ::-1].T)
         step = 0.0 if one.beam_time is None or not n else float(one.beam_time[0])
-        return stillmap.Recording.from_scans(
-            one.stamp_ns, one.ranges.reshape(T, n), angles, one.odometry, time_increment=step
-        )
+        scans = one.stamp_ns, one.ranges.reshape(T, n), angles, one.odometry
+        return stillmap.Recording.from_scans(*scans, time_increment=step)
     ends = np.cumsum(one.counts)[:-1]
     with np.errstate(all="ignore"):
         points = one.ranges[:, None] * one.directions
     times = None if one.beam_time is None else np.split(one.beam_time, ends)
-    return stillmap.Recording.from_clouds(
-        one.stamp_ns, np.split(points, ends), one.odometry, beam_times=times
-    )
+    clouds = one.stamp_ns, np.split(points, ends), one.odometry
+    return stillmap.Recording.from_clouds(*clouds, beam_times=times)
 
 
 def write(one, folder):
@@ -258,14 +253,11 @@ def write(one, folder):
 def _log_lines(one):
     n = int(one.counts[0])
     T = one.odometry if one.odometry is not None else np.tile(np.eye(3), (len(one.counts), 1, 1))
-    lines = []
-    for t, ranges in enumerate(one.ranges.reshape(len(T), n)):
-        yaw = np.arctan2(T[t, 1, 0], T[t, 0, 0])
-        pose = f"{T[t, 0, 2]!r} {T[t, 1, 2]!r} {yaw!r}".replace("np.float64(", "").replace(")", "")
-        readings = " ".join(f"{float(value)!r}" for value in ranges)
-        seconds = one.stamp_ns[t] / 1e9
-        lines.append(f"FLASER {n} {readings} {pose} {pose} {seconds!s} host {seconds!s}")
-    return lines
+    scans = one.ranges.reshape(len(T), n).tolist()
+    poses = np.column_stack([T[:, :2, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])]).tolist()
+    for ranges, pose, seconds in zip(scans, poses, (one.stamp_ns / 1e9).tolist(), strict=True):
+        readings = " ".join(map(repr, [n, *ranges, *pose, *pose, seconds]))
+        yield f"FLASER {readings} host {seconds!r}"
 
 
 def write_poses(one, path):
