@@ -2,10 +2,10 @@
 
 import json
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from report_page import Page
 
 from stillmap.cli.main import main
 from stillmap.io import trajectory as given_poses
@@ -79,40 +79,19 @@ def test_trimesh_reads_object_points(result):
         np.testing.assert_allclose(extra["p_dynamic"].mean(), one["p_dynamic"], atol=1e-5)
 
 
-class Links(HTMLParser):
-    """What a page would fetch, and whether every element that opens closes."""
-
-    VOID = ("meta", "link", "img", "br", "hr", "input", "col", "source", "area", "base")
-
-    def __init__(self):
-        super().__init__()
-        self.fetched, self.links, self.open, self.wrong = [], [], [], []
-
-    def handle_starttag(self, tag, attributes):
-        if tag not in self.VOID:
-            self.open.append(tag)
-        names = ("src", "href", "srcset", "data", "action", "poster", "xlink:href")
-        addresses = [value for name, value in attributes if name in names]
-        if tag == "a":
-            self.links += addresses
-        else:
-            self.fetched += addresses
-        self.fetched += [tag] * (tag in ("iframe", "object", "embed"))
-
-    def handle_endtag(self, tag):
-        if not self.open or self.open.pop() != tag:
-            self.wrong.append(tag)
-
-
 def test_report_is_complete_and_fetches_nothing(result):
-    page, text = Links(), (result / "report.html").read_text(encoding="utf-8")
-    page.feed(text)
-    assert (page.open, page.wrong) == ([], [])
-    assert page.fetched
-    inside = ("data:image/png;base64,", "#")
-    assert [value for value in page.fetched if not value.startswith(inside)] == []
-    assert page.links
-    assert [link for link in page.links if not (result / link).is_file()] == []
+    text = (result / "report.html").read_text(encoding="utf-8")
+    page = Page(text)  # every element that opens closes
+    names = ("src", "href", "srcset", "data", "action", "poster", "xlink:href")
+    fetched, links = [], []
+    for tag, attributes in page.tags:
+        assert tag not in ("iframe", "object", "embed")
+        addresses = [attributes[name] for name in names if name in attributes]
+        (links if tag == "a" else fetched).extend(addresses)
+    assert fetched
+    assert all(one.startswith(("data:image/png;base64,", "#")) for one in fetched)
+    assert links
+    assert [link for link in links if not (result / link).is_file()] == []
     assert re.findall(r"url\((?!#)", text) == []
     assert "@import" not in text
 
