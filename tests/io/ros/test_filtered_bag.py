@@ -66,6 +66,21 @@ def test_other_messages_are_copied(bag, messages, tmp_path):
     np.testing.assert_array_equal(again.T_odom_base, recording.T_odom_base)
 
 
+def test_damaged_messages_are_left_out(bag, kind, messages, tmp_path):
+    """Magic numbers say that they are compressed: of a topic that is read, and of another."""
+    name, _ = messages.odometry(START, (0, 0, 0), (0, 0, 0, 1))
+    broken = name, b"\x28\xb5\x2f\xfd" + b"\xff" * 20
+    source = bag([*scans(messages), ("/odom", START + 9, broken), ("/more", START + 9, broken)])
+    recording = read(source)
+    out = tmp_path / f"out{source.suffix}"
+    done = filtered(source, out, recording, np.ones(recording.n_beams, np.bool_))
+    # messages of ROS 1 are never compressed one by one
+    assert done.notes == (() if kind == "bag" else ("2 damaged messages are left out",))
+    again = read(out)
+    assert not again.hit.any()
+    np.testing.assert_array_equal(again.T_odom_base, recording.T_odom_base)
+
+
 @pytest.mark.parametrize("zeros", [20, 0])
 def test_the_no_return_code_of_the_laser_is_used(bag, messages, tmp_path, zeros):
     """Zeros are frequent: added infinities must not make them unusable."""

@@ -10,8 +10,9 @@ from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
-from stillmap.io.ros.bag import open_bag
+from stillmap.io.ros.bag import bag_size, open_bag
 from stillmap.io.ros.clouds import find_layout
+from stillmap.io.ros.limits import count_output, limit_output
 from stillmap.io.ros.messages import (
     MULTI_ECHO,
     POINT_CLOUD,
@@ -43,7 +44,10 @@ def write_filtered(job: FilterJob) -> Omissions:
     for trusted in (True, False):
         try:
             scratch = workplace(job.output)
-            with closing(open_bag([job.source], scratch, trusted=trusted)) as bag:
+            with (
+                limit_output(bag_size([job.source])),
+                closing(open_bag([job.source], scratch, trusted=trusted)) as bag,
+            ):
                 return _copy(bag, job)
         except DamagedBagError:
             continue
@@ -54,14 +58,14 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
     kind, mcap = detect_kind(job.source)
     kind = cast(BagKind, job.kind) if job.kind else kind
     topics, scan_of = _number_scans(job)
-    count, omitted, left = dict.fromkeys(topics, 0), 0, len(scan_of)
+    count, left = dict.fromkeys(topics, 0), len(scan_of)
+    omitted = damaged = 0
     total = max(sum(c.n_messages for c in bag.channels), 1)
     options = {"overwrite": job.overwrite, "mcap": mcap and kind == "ros2"}
     with new_bag(job.output, kind, **options) as copy:
         sends = {c.id: copy.copy_topic(c) for c in bag.channels}
         for number, message in enumerate(bag.messages({c.topic for c in bag.channels})):
-            channel, send = message.channel, sends[message.channel.id]
-            raw = decompress(message)
+            channel, scan = message.channel, None
             if channel.topic in topics:
                 count[channel.topic] += 1
                 scan = scan_of.get((channel.topic, count[channel.topic]))
@@ -69,9 +73,14 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
                     omitted += 1
                     continue
                 left -= 1
-                mask = job.blank[job.recording.beams_of(scan)]
-                if mask.any():
-                    raw = copy.serialize(_blank(message, mask, job), channel.type)
+            raw = _unpack(message)
+            if raw is None:
+                damaged += 1
+                continue
+            mask = None if scan is None else job.blank[job.recording.beams_of(scan)]
+            if mask is not None and mask.any():
+                raw = copy.serialize(_blank(message, mask, job), channel.type)
+            send = sends[channel.id]
             if send is not None:
                 send(message.log_ns, raw)
             if number % _PROGRESS_INTERVAL == 0:
@@ -82,7 +91,21 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
     unfiltered = {c.topic for c in bag.channels if c.type in SCAN_TYPES} - topics - unknown
     why = "left out: the bag does not say what its messages are made of"
     notes = [f"{topic} is as it was: it was not mapped" for topic in sorted(unfiltered)]
-    return Omissions(omitted, (*notes, *(f"{topic} {why}" for topic in sorted(unknown))))
+    notes += [f"{topic} {why}" for topic in sorted(unknown)]
+    notes += [f"{damaged} damaged messages are left out"] * bool(damaged)
+    return Omissions(omitted, tuple(notes))
+
+
+def _unpack(message: Message) -> bytes | None:
+    """The content of a message; None: it is damaged."""
+    try:
+        raw = decompress(message)
+    except InputError:
+        raise
+    except Exception:  # any error of the library about damaged data
+        return None
+    count_output(len(raw))
+    return raw
 
 
 def _number_scans(job: FilterJob) -> tuple[set[str], dict[tuple[str, int], int]]:
