@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
@@ -320,6 +319,8 @@ class MapFrame:
 def rotate_covariance(covariance: Float, T: Float) -> Float:
     """Covariance of a pose along the axes of another frame, in which its own frame has the pose
     T (D+1, D+1): (3, 3) of x, y and heading, in 3D (6, 6) of translation and rotation."""
-    R = T[:-1, :-1]
-    turn = block_diag(R, R if len(R) == 3 else np.eye(1))
+    D, turn = len(T) - 1, np.eye(len(covariance))
+    turn[:D, :D] = T[:D, :D]
+    if D == 3:
+        turn[D:, D:] = T[:D, :D]
     return np.asarray(turn @ covariance @ turn.T)
