@@ -15,9 +15,10 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from stillmap.core.array_types import Bool, Float, Index, Int32
 from stillmap.mesh.inputs import ObjectFrame
-from stillmap.mesh.range_image import SMOOTHING_ROUNDS, Patch, vertex_normals
+from stillmap.mesh.range_image import Patch
 from stillmap.mesh.returns import SPACING, DynamicReturns, grow_segment
 from stillmap.mesh.triangle_mesh import Mesh, remove_small_components
+from stillmap.mesh.triangulation import SMOOTHING_ROUNDS, vertex_normals
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
 _MIN_COSINE = 0.2  # from an object's center, up to which points are in one perspective image

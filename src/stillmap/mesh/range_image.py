@@ -3,8 +3,9 @@
 The neighborhood of beams is derived from their directions, whatever format they were read from:
 
 - scans in a plane through the sensor are rows, and successive scans are neighbors;
-- rings and columns of lidars, and rows of depth images: strips between one and the next;
-- all others: the Delaunay triangulation of the directions on the sphere.
+- scans divisible into rows of equal length, as depth images and columns of lidars, are grids;
+- scans in rows of different lengths, as rings of lidars without lost returns, are strips;
+- all others: the Delaunay triangulation of the directions.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,33 +14,28 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from stillmap.core.array_types import Bool, Float, Index, Int32
 from stillmap.core.recording import Recording
-from stillmap.mesh.beam_rows import split_rows, triangulate_strips
-from stillmap.mesh.triangle_mesh import cross_columns, dot_columns, normalize_columns, row_lengths
+from stillmap.mesh.triangulation import (
+    filter_faces,
+    split_rows,
+    triangulate_grid,
+    triangulate_strips,
+)
 from stillmap.slam.deskew import MAX_SCAN_GAP
 
-_MAX_RADIUS_RATIO = 3.0  # of a triangle's circumcircle to the median: else it spans a hole
-_MIN_BEAMS = 4  # of a scan whose layout can be told
-_JITTER = 1e-6  # rad: four directions on a circle, as in grids, take Qhull ten times longer
+_MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole
+_SAMPLES = 2000  # beams by which row lengths are tested
+_MIN_ROW_LENGTH = 4  # beams
+_MAX_SPACING = 0.15  # rad between neighbors in a row or in a column
+_MAX_ROW_RATIO = 30.0  # of the angle between rows to that between beams
+_MAX_ROW_COSINE = 0.5  # between the directions of rows and columns
 _FLATNESS = 0.04  # rad from a plane: a planar laser may sit off its joint
 _MIN_SPREAD = 0.2  # rad within the plane
 _TESTED_SCANS = 9  # that tell whether scans are planar
 _ROWS_PER_PATCH = 128  # planar scans triangulated together
-_CELL_KEYS = np.array([1 << 42, 1 << 21, 1])  # make one number of a cell of directions
-
-_MAX_EDGE = 1.5  # m: longer edges span holes
-_MAX_EDGE_SHARE = 0.15  # of the range, likewise
-_MAX_INCIDENCE = 1.5  # rad between line of sight and normal
-_STEEP = 1.22  # rad of incidence from which on a triangle must be coplanar with those around
-_MAX_BEND = 0.35  # rad between the normals of such a triangle and those around
-SMOOTHING_ROUNDS = 2  # in which vertex normals are averaged with their neighbors'
-_FULL_FAN = 6  # triangles around a vertex with neighbors on all sides
-# median of |x - mean of six neighbors| over the noise's standard deviation: 0.6745 sqrt(7 / 6)
-_MEDIAN_DEVIATION = 0.73
-_MAX_NOISE_RATIO = 5.0  # standard deviations between the ranges of three corners
 
 
 class Patch(NamedTuple):
@@ -66,12 +62,12 @@ class ScanLayout(NamedTuple):
     Attributes:
         is_planar: whether each scan is a row.
         groups: scans of each range image.
-        min_angle: rad between beams that are used, about, but for planar scans; 0: all are.
+        stride: every how many-th row and column is used, but for planar scans.
     """
 
     is_planar: bool
     groups: list[Index]
-    min_angle: float = 0.0
+    stride: int = 1
 
 
 def beam_directions(points: NDArray[np.floating]) -> Float:
@@ -81,10 +77,47 @@ def beam_directions(points: NDArray[np.floating]) -> Float:
     return np.asarray(wide / np.where(length > 0.0, length, np.nan))
 
 
+def find_row_length(directions: Float) -> int:
+    """Number of beams in each row of a range image; 0: the scan is no grid.
+
+    Within rows directions change little, and from row to row at a right angle to that. The
+    shortest divisor of the number of beams for which this holds.
+
+    Args:
+        directions: (n, 3) row by row, NaN where unknown.
+    """
+    n = len(directions)
+    step = max(n // _SAMPLES, 1)
+    for length in range(_MIN_ROW_LENGTH, n // 2 + 1):
+        if n % length == 0 and _is_row_length(directions, length, step):
+            return length
+    return 0
+
+
+def _is_row_length(directions: Float, length: int, step: int) -> bool:
+    # not all in one column
+    k = np.arange(0, len(directions) - length - 1, step)
+    k += np.arange(len(k)) % 7
+    k = k[(k + length < len(directions)) & (k % length != length - 1)]
+    along, across = directions[k + 1] - directions[k], directions[k + length] - directions[k]
+    known = np.isfinite(along).all(axis=1) & np.isfinite(across).all(axis=1)
+    if np.count_nonzero(known) < max(8, len(k) // 20):
+        return False
+    along, across = along[known], across[known]
+    one, other = np.linalg.norm(along, axis=1), np.linalg.norm(across, axis=1)
+    spacing, widest = float(np.median(one)), float(np.percentile(other, 90))
+    if not 0.0 < spacing <= _MAX_SPACING:
+        return False
+    if not 0.0 < widest <= min(_MAX_SPACING, _MAX_ROW_RATIO * spacing):
+        return False
+    cosine = np.abs(np.einsum("ni,ni->n", along, across)) / np.maximum(one * other, 1e-300)
+    return float(np.median(cosine)) < _MAX_ROW_COSINE
+
+
 def is_planar(directions: Float) -> bool:
     """True if beams with directions (n, 3), NaN where unknown, lie in one plane."""
     known = directions[np.isfinite(directions).all(axis=1)]
-    if len(known) < _MIN_BEAMS:
+    if len(known) < _MIN_ROW_LENGTH:
         return False
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(known.T @ known / len(known)), 0.0))
     return bool(spread[0] < _FLATNESS and spread[1] > _MIN_SPREAD)
@@ -111,11 +144,17 @@ def median_angle(one: Float, other: Float) -> float:
     return float(2.0 * np.arcsin(0.5 * np.median(known))) if len(known) else float("nan")
 
 
-def find_scan_layout(recording: Recording) -> ScanLayout:
-    """The range images of all scans of a 3D recording."""
+def find_scan_layout(recording: Recording, chosen: Index) -> ScanLayout:
+    """The range images of a 3D recording.
+
+    Args:
+        recording: 3D.
+        chosen: scans to be used; where scans are rows, all are.
+    """
+    counts = np.diff(recording.offset)
     if is_row_scanner(recording):
         return ScanLayout(True, _split_sequences(recording))
-    return ScanLayout(False, list(np.flatnonzero(np.diff(recording.offset))[:, None]))
+    return ScanLayout(False, [np.array([t]) for t in chosen if counts[t]])
 
 
 def _split_sequences(recording: Recording) -> list[Index]:
@@ -143,193 +182,82 @@ def triangulate_scans(
         poses: (T, 4, 4) T_map_base.
         layout: see `find_scan_layout`.
     """
+    row_lengths: dict[tuple[int, int], int] = {}
     for scans in layout.groups:
-        yield partial(_make_patch, recording, poses, scans, layout)
+        yield partial(_make_patch, recording, poses, scans, layout, row_lengths)
 
 
-def _make_patch(recording: Recording, poses: Float, scans: Index, layout: ScanLayout) -> Patch:
+def _make_patch(
+    recording: Recording,
+    poses: Float,
+    scans: Index,
+    layout: ScanLayout,
+    row_lengths: dict[tuple[int, int], int],
+) -> Patch:
     beam = np.concatenate([np.arange(recording.offset[t], recording.offset[t + 1]) for t in scans])
     local, points = recording.points[beam].astype(np.float64), recording.end_points(beam, poses)
-    T = poses[scans] @ recording.T_base_sensor[recording.sensor[scans]]
-    origin = T[np.searchsorted(scans, recording.scans_of(beam)), :3, 3]
+    sensor, scan = recording.sensor[scans], np.searchsorted(scans, recording.scans_of(beam))
+    T = poses[scans] @ recording.T_base_sensor[sensor]
+    origin = T[scan, :3, 3]
+    x, y, z = points.T
     # a return at the sensor itself has no direction
-    use = recording.hit[beam] & np.isfinite(points).all(axis=1) & local.any(axis=1)
+    use = recording.hit[beam] & np.isfinite(x + y + z) & local.any(axis=1)
     points[~use] = 0.0  # in no triangle
     directions = beam_directions(local)
     if layout.is_planar:
-        faces = _triangulate_rows(points, use, directions, len(scans))
+        R = recording.T_base_sensor[sensor, :3, :3]
+        directions = np.einsum("nij,nj->ni", R[scan], directions)
+        row_length = len(beam) // len(scans)
     else:
-        directions = directions @ recording.T_base_sensor[recording.sensor[scans[0]], :3, :3].T
-        faces = _triangulate_directions(directions, use, layout.min_angle)
+        key = (int(sensor[0]), len(beam))
+        if key not in row_lengths:
+            row_lengths[key] = find_row_length(directions)
+        row_length = row_lengths[key]
+    faces = _triangulate_image(points, use, directions, row_length, layout)
     faces, standoff = filter_faces(points, origin, faces)
-    used, number = np.unique(faces, return_inverse=True)
-    faces = number.reshape(-1, 3).astype(np.int32)
-    return Patch(points[used], faces, beam[used], origin[used], standoff[used])
+    used = np.zeros(len(points), np.bool_)
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return Patch(points[used], number[faces], beam[used], origin[used], standoff[used])
 
 
-def _triangulate_rows(points: Float, use: Bool, directions: Float, rows: int) -> Int32:
-    """(m, 3) triangles between successive planar scans of one length."""
-    number = np.arange(len(points), dtype=np.int32).reshape(rows, -1)
-    spacing = median_angle(directions[:-1], directions[1:])
-    if median_angle(directions[number[:, -1]], directions[number[:, 0]]) < 2.0 * spacing:
-        number = np.concatenate([number, number[:, :1]], axis=1)  # they go all around
-    return triangulate_grid(points, use, number)
+def _triangulate_image(
+    points: Float, use: Bool, directions: Float, row_length: int, layout: ScanLayout
+) -> Int32:
+    """Triangles of a range image; a row length of 0 means that it is no grid."""
+    if not row_length:
+        return _triangulate_without_grid(use, directions)
+    number = np.arange(len(points), dtype=np.int32).reshape(-1, row_length)
+    along = median_angle(directions[:-1], directions[1:])
+    across = median_angle(directions[:-row_length], directions[row_length:])
+    if median_angle(directions[number[:, -1]], directions[number[:, 0]]) < 2.0 * along:
+        number = np.concatenate([number, number[:, :1]], axis=1)
+    if layout.is_planar:
+        return triangulate_grid(points, use, number)
+    around = median_angle(directions[number[-1]], directions[number[0]])
+    if len(number) > 2 and around < 2.0 * across:
+        number = np.concatenate([number, number[:1]])
+    return triangulate_grid(points, use, number[:: layout.stride, :: layout.stride])
 
 
-def _triangulate_directions(directions: Float, use: Bool, min_angle: float) -> Int32:
-    """(m, 3) triangles of valid beams: strips between rows, else the Delaunay triangulation.
-
-    On the sphere that is a convex hull. Lost returns whose directions are known take part, so that
-    no triangle spans them.
-    """
-    beams = np.flatnonzero(np.isfinite(directions).all(axis=1))
-    beams = beams[np.argsort(~use[beams], kind="stable")]  # of beams close together a valid one
-    if min_angle > 0.0:
-        cells = np.floor(directions[beams] / min_angle).astype(np.int64)
-        beams = beams[np.unique(cells @ _CELL_KEYS, return_index=True)[1]]
-    beams = np.sort(beams)
-    if len(beams) < _MIN_BEAMS or is_planar(directions[beams]):
+def _triangulate_without_grid(use: Bool, directions: Float) -> Int32:
+    """Triangles between valid beams that form strips or no grid; long triangles are left out."""
+    beams = np.flatnonzero(use)
+    if len(beams) < 3:
         return np.zeros((0, 3), np.int32)
-    rng = np.random.default_rng(0)
-    corners = beam_directions(directions[beams] + rng.normal(0.0, _JITTER, (len(beams), 3)))
-    rows = split_rows(directions[beams])
-    faces = ConvexHull(corners).simplices if rows is None else triangulate_strips(rows)
-    edges = corners[faces] - corners[np.roll(faces, 1, axis=1)]
-    area = 0.5 * row_lengths(np.cross(edges[:, 0], edges[:, 1]))
-    radius = np.linalg.norm(edges, axis=2).prod(axis=1) / np.maximum(4.0 * area, 1e-300)
-    kept = (radius <= _MAX_RADIUS_RATIO * np.median(radius)) & use[beams[faces]].all(axis=1)
-    return np.asarray(beams[faces[kept]], np.int32)
+    valid = directions[beams]
+    rows = split_rows(valid)
+    faces = triangulate_directions(valid) if rows is None else triangulate_strips(rows)
+    if not len(faces):
+        return faces
+    chord = np.linalg.norm(valid[faces] - np.roll(valid[faces], 1, axis=1), axis=2).max(axis=1)
+    faces = faces[chord <= _MAX_SPACING_RATIO * np.median(chord)]
+    return np.asarray(beams[faces], np.int32)
 
 
-def triangulate_grid(points: Float, use: Bool, number: Int32) -> Int32:
-    """(m, 3) two triangles per cell of a range image, one where a corner is missing.
-
-    Cells are split along the shorter diagonal.
-
-    Args:
-        points: (n, 3) metres.
-        use: (n,) which points are valid.
-        number: (H, W) of the point at each pixel.
-    """
-    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
-    d, c = number[1:, :-1].ravel(), number[1:, 1:].ravel()
-    some = np.flatnonzero(use[a].astype(np.int8) + use[b] + use[c] + use[d] >= 3)
-    a, b, c, d = a[some], b[some], c[some], d[some]
-    ua, ub, uc, ud = use[a], use[b], use[c], use[d]
-    columns = _columns(points)
-    with np.errstate(invalid="ignore"):
-        shorter = _squared_distances(columns, a, c) <= _squared_distances(columns, b, d)
-    by_ac = np.where(ua & uc & ub & ud, shorter, ua & uc)
-    triangles = (
-        ((a, b, c), by_ac & ub),
-        ((a, c, d), by_ac & ud),
-        ((a, b, d), ~by_ac & ua),
-        ((b, c, d), ~by_ac & uc),
-    )
-    parts = [np.column_stack([one[kept] for one in corners]) for corners, kept in triangles]
-    return np.concatenate(parts).astype(np.int32)
-
-
-def _columns(points: Float) -> Float:
-    """(3, n): operations on long rows are fast."""
-    return np.ascontiguousarray(points.T)
-
-
-def _squared_distances(columns: Float, a: Int32, b: Int32) -> Float:
-    return np.asarray(sum((x[a] - x[b]) ** 2 for x in columns))
-
-
-def filter_faces(points: Float, origin: Float, faces: Int32) -> tuple[Int32, Float]:
-    """The triangles that do not span holes or depth discontinuities.
-
-    A triangle at grazing incidence is either part of such a surface, as distant floor, and then
-    coplanar with those around; or it leads from an object's edge to the background. If its corners
-    are equally distant up to range noise, its angle is not meaningful, and it stays.
-
-    Args:
-        points: (n, 3) metres.
-        origin: (n, 3) sensor position of each.
-        faces: (m, 3).
-
-    Returns:
-        (m, 3) counter-clockwise as seen from the sensor; (n,) metres from the sensor to the tangent
-        plane at each point, 0 where there is no triangle.
-    """
-    columns, corners = _columns(points), [np.ascontiguousarray(k) for k in faces.T]
-    a, b, c = (columns[:, k] for k in corners)
-    ab, bc, ca = b - a, c - b, a - c
-    cross, sight = cross_columns(ca, ab), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
-    area, range = np.sqrt(dot_columns(cross, cross)), np.sqrt(dot_columns(sight, sight))
-    longest = np.sqrt(np.max([dot_columns(edge, edge) for edge in (ab, bc, ca)], axis=0))
-    facing = dot_columns(cross, sight)
-    # counter-clockwise as seen from the sensor
-    away = facing < 0.0
-    faces = np.where(away[:, None], faces[:, ::-1], faces)
-    cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
-    level = has_equal_ranges(row_lengths(origin - points), faces)
-    limit = np.minimum(_MAX_EDGE, _MAX_EDGE_SHARE * range)
-    kept = (longest <= limit) & (level | (cosine >= np.cos(_MAX_INCIDENCE))) & (area > 0.0)
-    faces, cosine = faces[kept], cosine[kept]
-    normals = cross[:, kept] * (np.where(away, -1.0, 1.0) / np.maximum(area, 1e-300))[kept]
-    steep = np.flatnonzero((cosine < np.cos(_STEEP)) & ~level[kept])
-    at_points = vertex_normals(normals, faces, len(points), 0)
-    along = [dot_columns(at_points[:, faces[steep, k]], normals[:, steep]) for k in (0, 1, 2)]
-    fits = np.ones(len(faces), np.bool_)
-    # at two corners: the third may lie in the corner of a room
-    fits[steep] = np.sort(along, axis=0)[1] >= np.cos(_MAX_BEND)
-    faces, normals = faces[fits], normals[:, fits]
-    smooth = vertex_normals(normals, faces, len(points), SMOOTHING_ROUNDS)
-    standoff = dot_columns(smooth, _columns(origin - points))
-    return faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0)
-
-
-def has_equal_ranges(range: Float, faces: Int32) -> Bool:
-    """(m,) whether the corners of triangles are equally distant up to noise.
-
-    Args:
-        range: (n,) metres.
-        faces: (m, 3).
-    """
-    between = np.ptp(range[faces.T], axis=0)
-    return np.asarray(between <= _MAX_NOISE_RATIO * range_std(range, faces))
-
-
-def range_std(range: Float, faces: Int32) -> float:
-    """Standard deviation of the noise of ranges (n,) in metres; 0 where it is unknown.
-
-    From the median distance of each range from the mean of its neighbors.
-    """
-    count = np.bincount(faces.ravel(), minlength=len(range))
-    each = range[faces[:, 0]] + range[faces[:, 1]] + range[faces[:, 2]]
-    total = np.bincount(faces.ravel(), np.repeat(each, 3), len(range))
-    inside = count >= _FULL_FAN
-    if not inside.any():
-        return 0.0
-    # each triangle around counts the point itself, and each neighbor is in two
-    around = (total[inside] - count[inside] * range[inside]) / (2 * count[inside])
-    return float(np.median(np.abs(around - range[inside]))) / _MEDIAN_DEVIATION
-
-
-def vertex_normals(normals: Float, faces: Int32, n: int, rounds: int) -> Float:
-    """(3, n) unit normals of n points: the means of those of the triangles around.
-
-    Args:
-        normals: (3, m) normals of the triangles, whose lengths are weights.
-        faces: (m, 3).
-        n: number of points.
-        rounds: how often they are averaged again over the triangles' corners.
-    """
-    corner = faces.ravel().astype(np.intp)
-    a, b, c = (np.ascontiguousarray(k) for k in faces.T)
-    out = _average_at_points(normals, corner, n)
-    for _ in range(rounds):
-        mean = normalize_columns(np.stack([x[a] + x[b] + x[c] for x in out]))
-        out = _average_at_points(mean, corner, n)
-    return out
-
-
-def _average_at_points(normals: Float, corner: Index, n: int) -> Float:
-    out = np.empty((3, n))
-    for d, along in enumerate(normals):
-        out[d] = np.bincount(corner, np.repeat(along, 3), n)
-    return normalize_columns(out)
+def triangulate_directions(directions: Float) -> Int32:
+    """(m, 3) the Delaunay triangulation of unit vectors (n, 3) on the sphere: their convex hull."""
+    try:
+        return ConvexHull(directions).simplices.astype(np.int32)
+    except QhullError:  # all in one plane
+        return np.zeros((0, 3), np.int32)

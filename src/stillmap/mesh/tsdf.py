@@ -5,10 +5,11 @@ Curless and Levoy, "A Volumetric Method for Building Complex Models from Range I
 """
 
 from collections.abc import Callable, Iterable
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
+from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
@@ -17,13 +18,7 @@ from stillmap.core.errors import import_extra
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import MeshOptions
-from stillmap.mesh.range_image import (
-    Patch,
-    ScanLayout,
-    find_scan_layout,
-    range_std,
-    triangulate_scans,
-)
+from stillmap.mesh.range_image import Patch, ScanLayout, find_scan_layout, triangulate_scans
 from stillmap.mesh.triangle_mesh import (
     Mesh,
     Tell,
@@ -35,11 +30,12 @@ from stillmap.mesh.triangle_mesh import (
     simplify_to_budget,
     weld,
 )
+from stillmap.mesh.triangulation import range_std
 
 _SAMPLED_PATCHES = 8
 _MIN_VOXEL, _MAX_VOXEL = 0.02, 0.2  # m; depth cameras are no more exact than the first
 _NOISE_RATIO = 2.5  # voxel edge over the standard deviation of ranges, at least
-_MAX_SPACING = 0.75  # voxels between beams that are used
+_MAX_SPACING = 0.75  # voxels between rows that are used
 _MAX_BYTES = 0.75e9  # of the voxels
 _AREA_CELL = 0.5  # m, cells by which surface area is estimated
 _SAMPLED_BEAMS = 200_000
@@ -48,35 +44,57 @@ _BLOCK_EDGE, _BLOCK_BYTES = 8, 4200  # voxels along a block, and its size
 _MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
 _MIN_TURN = 0.1  # rad, likewise
 _SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a mover
+_SAMPLED_SCANS = 64  # of which the ranges are taken
+_MIN_CELL = 1e-3  # m, of the cells by which viewpoints nearby are found
+_AROUND = list(product((-1, 0, 1), repeat=3))
 
 
-def select_scans(T_map_sensor: Float, sensor: Int32, scene_range: float) -> Index:
+def median_range(recording: Recording) -> float:
+    """Median range in metres of the hits of some scans; 0 where there are none."""
+    n = recording.n_scans
+    sampled = np.unique(np.linspace(0, n - 1, min(n, _SAMPLED_SCANS)).astype(np.intp))
+    parts = [recording.points[b][recording.hit[b]] for b in map(recording.beams_of, sampled)]
+    ranges = np.concatenate([np.zeros(0), *(np.linalg.norm(part, axis=1) for part in parts)])
+    ranges = ranges[np.isfinite(ranges)]
+    return float(np.median(ranges)) if len(ranges) else 0.0
+
+
+def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
     """The first `_SCANS_PER_PLACE` scans from each viewpoint.
 
     Args:
         T_map_sensor: (T, 4, 4).
         sensor: (T,) sensor of each scan.
-        scene_range: metres, median.
+        range: metres, median.
     """
     position, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
+    travel = _MIN_TRAVEL_SHARE * range
+    # by cells, so that each scan is compared only with those around
+    cells = np.floor(position / max(travel, _MIN_CELL)).astype(np.int64).tolist()
+    known: dict[tuple[int, ...], list[int]] = {}
     chosen = list[int]()
-    for t in range(len(position)):
-        near = np.array(chosen, np.intp)
-        distance = np.linalg.norm(position[near] - position[t], axis=1)
-        near = near[(sensor[near] == sensor[t]) & (distance < _MIN_TRAVEL_SHARE * scene_range)]
+    for t, (x, y, z) in enumerate(cells):
+        mine = int(sensor[t])
+        around = [known.get((mine, x + i, y + j, z + k), ()) for i, j, k in _AROUND]
+        before = np.fromiter(chain.from_iterable(around), np.intp)
+        near = before[np.linalg.norm(position[before] - position[t], axis=1) < travel]
         cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
         if np.count_nonzero(cosine > np.cos(_MIN_TURN)) < _SCANS_PER_PLACE:
             chosen.append(t)
+            known.setdefault((mine, x, y, z), []).append(t)
     return np.array(chosen, np.intp)
 
 
 def choose_resolution(
-    recording: Recording, poses: Float, layout: ScanLayout, voxel_size: float | None = None
-) -> tuple[float, float, float]:
-    """The edge of a voxel and the median range in metres, and the angle in rad between beams.
+    recording: Recording,
+    poses: Float,
+    layout: ScanLayout,
+    voxel_size: float | None = None,
+) -> tuple[float, int]:
+    """The edge of a voxel in metres, and the stride of rows and columns of range images.
 
     A voxel is as wide as the beam spacing on surfaces, and wider than range noise; larger where
-    memory would exceed its limit. Where beams lie much denser than voxels, some are left out.
+    memory would exceed its limit. The stride keeps the spacing of beams below that.
 
     Args:
         recording: 3D, deskewed.
@@ -91,18 +109,14 @@ def choose_resolution(
     patches = [make() for make in triangulate_scans(recording, poses, some)]
     patches = [one for one in patches if len(one.faces)]
     if not patches:
-        return voxel_size or _MAX_VOXEL, 0.0, 0.0
+        return voxel_size or _MAX_VOXEL, 1
     spacing = float(np.median([beam_spacing(one) for one in patches]))
     ranges = [np.linalg.norm(one.points - one.origin, axis=1) for one in patches]
     noises = [range_std(away, one.faces) for away, one in zip(ranges, patches, strict=True)]
     noise = float(np.median(noises))
     wanted = float(np.clip(max(spacing, _NOISE_RATIO * noise), _MIN_VOXEL, _MAX_VOXEL))
     voxel = voxel_size or max(wanted, min_voxel_size(recording, poses))
-    sampled = np.arange(0, recording.n_beams, max(recording.n_beams // _SAMPLED_BEAMS, 1))
-    hits = recording.points[sampled[recording.hit[sampled]]]
-    scene_range = float(np.nanmedian(np.linalg.norm(hits, axis=1)))
-    wide = _MAX_SPACING * voxel
-    return voxel, scene_range, wide / scene_range if wide >= 2.0 * spacing else 0.0
+    return voxel, max(int(_MAX_SPACING * voxel / spacing), 1) if spacing > 0.0 else 1
 
 
 def beam_spacing(patch: Patch) -> float:
@@ -128,7 +142,6 @@ def min_voxel_size(recording: Recording, poses: Float) -> float:
 
 _MIN_P_STATIC = 0.8  # product over a triangle's beams; below, a beam has little but its prior
 TILE = 64  # voxels along a tile, whole blocks
-_UNKNOWN = -1e6  # m, below all distances: a cube with one such corner has too large a step
 _MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
 _TRUNCATION = 3.0, 2.0  # voxels in front of a surface and behind it
 _MIN_AREA = 0.05  # m2: smaller connected components are dropped
@@ -153,13 +166,11 @@ def build_surface(
         tell: called with the work done and the total.
     """
     options = options or MeshOptions()
-    layout = find_scan_layout(recording)
-    voxel, scene_range, min_angle = choose_resolution(recording, poses, layout, options.voxel_size)
-    if not layout.is_planar:
-        scans = np.concatenate([np.zeros(0, np.intp), *layout.groups])
-        T_map_sensor = recording.T_map_sensor(poses)[scans]
-        chosen = select_scans(T_map_sensor, recording.sensor[scans], scene_range)
-        layout = ScanLayout(False, [scans[[k]] for k in chosen], min_angle)
+    T = recording.T_map_sensor(poses)
+    chosen = select_scans(T, recording.sensor, median_range(recording))
+    layout = find_scan_layout(recording, chosen)
+    voxel, stride = choose_resolution(recording, poses, layout, options.voxel_size)
+    layout = layout._replace(stride=stride)
     n = len(layout.groups)
 
     def weighted(make: Callable[[], Patch]) -> tuple[Patch, Float32]:
@@ -243,12 +254,10 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     first = [int(c) * TILE for c in tile]
     metres, weight = volume.dense(first, [TILE + 1] * 3)
     known = weight > min_weight
-    values = np.where(known, metres, np.float32(_UNKNOWN))
-    low, high = (
-        reduce(values, 2, origin=-1)[:-1, :-1, :-1]
-        for reduce in (ndimage.minimum_filter, ndimage.maximum_filter)
-    )
-    cubes = (low < 0.0) & (high >= 0.0) & (high - low <= _MAX_STEP * volume.voxel)
+    cubes = _reduce_cubes(np.logical_and, known)
+    low = _reduce_cubes(np.minimum, np.where(known, metres, np.inf))
+    high = _reduce_cubes(np.maximum, np.where(known, metres, -np.inf))
+    cubes &= (low < 0.0) & (high >= 0.0) & (high - low <= _MAX_STEP * volume.voxel)
     if not cubes.any():
         return Mesh.empty()
     # scikit-image tests the mask at the last corner of a cube
@@ -261,3 +270,14 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     mesh = weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
     # vertices are counted from the center of voxel 0
     return Mesh((mesh.vertices + 0.5) * volume.voxel, mesh.faces)
+
+
+def _reduce_cubes(
+    ufunc: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]], values: NDArray[Any]
+) -> NDArray[Any]:
+    """Reduces the eight corners of each cube."""
+    for axis in range(3):
+        low = tuple(slice(None, -1) if d == axis else slice(None) for d in range(3))
+        high = tuple(slice(1, None) if d == axis else slice(None) for d in range(3))
+        values = ufunc(values[low], values[high])
+    return values

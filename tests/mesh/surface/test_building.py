@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stillmap.mesh import range_image, tsdf
+from stillmap.mesh import triangulation, tsdf
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.tsdf import build_surface
 
@@ -14,7 +14,7 @@ OPTIONS = MeshOptions(voxel_size=0.1)
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """The beams of these tests lie far apart."""
-    monkeypatch.setattr(range_image, "_MAX_EDGE_SHARE", 1.0)
+    monkeypatch.setattr(triangulation, "_MAX_EDGE_SHARE", 1.0)
 
 
 def static(recording):

@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh import range_image
+from stillmap.mesh import range_image, triangulation
 from stillmap.mesh.range_image import find_scan_layout, triangulate_scans
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.triangulation import split_rows
 
 
 @pytest.fixture(autouse=True)
 def loose(monkeypatch):
     """The beams of these tests lie far apart."""
-    monkeypatch.setattr(range_image, "_MAX_EDGE", 5.0)
-    monkeypatch.setattr(range_image, "_MAX_EDGE_SHARE", 2.0)
+    monkeypatch.setattr(triangulation, "_MAX_EDGE", 5.0)
+    monkeypatch.setattr(triangulation, "_MAX_EDGE_SHARE", 2.0)
 
 
 def patches(recording, poses):
-    order = find_scan_layout(recording)
+    order = find_scan_layout(recording, np.arange(recording.n_scans))
     return order, [make() for make in triangulate_scans(recording, poses, order)]
 
 
@@ -25,6 +25,32 @@ def looks_back(patch):
     a, b, c = np.moveaxis(patch.points[patch.faces], 1, 0)
     sight = patch.origin[patch.faces[:, 0]] - a
     return np.einsum("ni,ni->n", np.cross(b - a, c - a), sight) > 0
+
+
+@pytest.mark.parametrize(
+    ("sensor", "made", "length"),
+    [
+        ("lidar", (), 24),
+        ("lidar", (240, 24, "rings"), 240),
+        ("lidar", (360, 16), 16),
+        ("lidar", (1800, 16, "rings"), 1800),
+        ("picture", (), 64),
+        ("picture", (40, 60), 40),
+    ],
+)
+def test_rows_are_found(room, sensor, made, length):
+    looking = getattr(room, sensor)(*made)
+    assert range_image.find_row_length(looking) == length
+    noisy = looking.copy()
+    noisy[np.random.default_rng(0).random(len(noisy)) < 0.2] = np.nan
+    assert range_image.find_row_length(noisy) == length
+
+
+def test_planar_lasers_are_told_from_others(room):
+    assert range_image.is_planar(room.nodding()[7])
+    assert not range_image.is_planar(room.lidar())
+    assert not range_image.is_planar(room.picture())
+    assert not range_image.is_planar(np.tile([1.0, 0.0, 0.0], (50, 1)))
 
 
 def test_any_order_makes_the_same_surface(room):
@@ -45,14 +71,23 @@ def test_rows_with_gaps_make_the_same_surface(room, rows_are, sense):
     rng = np.random.default_rng(0)
     sector = np.arctan2(looking[:, 1], looking[:, 0])
     looking = looking[(rng.random(len(looking)) < 0.95) & (np.abs(sector - 1.0) > 0.2)]
+    found = split_rows(looking)
+    assert len(found.first) - 1 == (240 - 15 if rows_are == "columns" else 40)
     recording = room.scans(looking, room.standing())
     _, (patch,) = patches(recording, room.standing())
-    mesh = Mesh(patch.points, patch.faces)
-    _, (whole,) = patches(room.scans(room.lidar(240, 40), room.standing()), room.standing())
-    most = Mesh(whole.points, whole.faces).areas().sum()
-    assert 0.8 * most < mesh.areas().sum() < 0.99 * most
+    looking = patch.points[patch.faces]
+    area = 0.5 * np.linalg.norm(
+        np.cross(looking[:, 1] - looking[:, 0], looking[:, 2] - looking[:, 0]), axis=1
+    )
+    _, (whole,) = patches(*[room.scans(room.lidar(240, 40), room.standing()), room.standing()])
+    all_of_it = whole.points[whole.faces]
+    most = 0.5 * np.linalg.norm(
+        np.cross(all_of_it[:, 1] - all_of_it[:, 0], all_of_it[:, 2] - all_of_it[:, 0]), axis=1
+    )
+    assert 0.8 * most.sum() < area.sum() < 0.99 * most.sum()
     assert looks_back(patch).all()
-    assert (np.abs(np.arctan2(*mesh.centers[:, 1::-1].T) - 1.0) > 0.15).all()
+    middle = looking.mean(axis=1)
+    assert (np.abs(np.arctan2(middle[:, 1], middle[:, 0]) - 1.0) > 0.15).all()
 
 
 def test_scans_of_a_nodding_laser_are_rows_while_the_robot_drives(room):

@@ -4,14 +4,17 @@ import base64
 import functools
 import hashlib
 import math
+import os
+import sys
 from collections.abc import Iterable, Mapping
+from importlib.util import cache_from_source
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.files import package_version
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from jinja2 import BytecodeCache, Environment
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -33,6 +36,7 @@ def _environment() -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
+        bytecode_cache=_bytecode_cache(),
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
@@ -41,6 +45,23 @@ def _environment() -> "Environment":
     )
     environment.filters.update(FILTERS)
     return environment
+
+
+def _bytecode_cache() -> "BytecodeCache | None":
+    """Compiled templates, kept where Python keeps its modules; None: Python keeps none either.
+
+    Compiling takes longer than rendering.
+    """
+    if sys.dont_write_bytecode:
+        return None
+    from jinja2 import FileSystemBytecodeCache
+
+    folder = Path(cache_from_source(str(_TEMPLATES / "report.py"))).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return FileSystemBytecodeCache(str(folder)) if os.access(folder, os.W_OK) else None
 
 
 def format_share(share: float) -> str:
