@@ -25,15 +25,6 @@ def turned(recording):
     return dataclasses.replace(recording, T_base_sensor=se2.matrix([0.08], [0.0], [1.0]))
 
 
-def given(**options):
-    return config.override(OPTIONS, {"read": options})
-
-
-def with_notes(recording, **notes):
-    source = Source.from_dict({"sensors": [notes]})
-    return dataclasses.replace(recording, source=source)
-
-
 def test_a_recording_that_is_right_is_not_touched(simulation):
     recording, found, sentences = calibrate_recording(simulation.recording, OPTIONS)
     assert recording is simulation.recording
@@ -47,8 +38,8 @@ def test_a_turned_laser(simulation):
     assert abs(theta) < 0.02
     assert (x, y) == pytest.approx((0.08, 0.0))
     assert recording.T_odom_base is simulation.recording.T_odom_base
-    assert len(sentences) == 1
-    assert "57.3 as recorded" in sentences[0]
+    (sentence,) = sentences
+    assert "57.3 as recorded" in sentence
 
 
 @pytest.mark.parametrize(
@@ -60,8 +51,10 @@ def test_a_turned_laser(simulation):
     ],
 )
 def test_what_was_told_stays(simulation, notes, options):
-    recording = with_notes(turned(simulation.recording), **notes)
-    after, found, _ = calibrate_recording(recording, given(**options))
+    source = Source.from_dict({"sensors": [notes]})
+    recording = dataclasses.replace(turned(simulation.recording), source=source)
+    given = config.override(OPTIONS, {"read": options})
+    after, found, _ = calibrate_recording(recording, given)
     assert np.array_equal(after.T_base_sensor[0, :2, :2], recording.T_base_sensor[0, :2, :2])
     assert "theta" not in found.lasers[0]
 
@@ -69,8 +62,7 @@ def test_what_was_told_stays(simulation, notes, options):
 @pytest.mark.slow
 def test_the_result_is_that_of_the_corrected_recording(simulation):
     mirrored = mirror_beams(simulation.recording, 0)
-    result = stillmap.build(mirrored, OPTIONS)
-    told = stillmap.build(simulation.recording, OPTIONS)
+    result, told = (stillmap.build(one, OPTIONS) for one in (mirrored, simulation.recording))
     assert np.array_equal(result.poses, told.poses)
     assert np.array_equal(result.p_static, told.p_static, equal_nan=True)
     assert result.calibration.upside_down == [True]

@@ -63,15 +63,13 @@ def test_a_planar_laser(room, tmp_path):
     assert near.objects
     assert "local_origin" not in near.run
     assert far.run["local_origin"] == [*UTM[:2], 0.0]
-    for name, result in (("near", near), ("far", far)):
-        result.save(tmp_path / name)
-    maps = [yaml.safe_load((tmp_path / name / "map.yaml").read_text()) for name in ("near", "far")]
-    apart = np.subtract(maps[1]["origin"][:2], maps[0]["origin"][:2])
-    np.testing.assert_allclose(apart, UTM[:2], atol=1e-8)
-    pixels = [(tmp_path / name / "map.pgm").read_bytes() for name in ("near", "far")]
-    assert pixels[0] == pixels[1]
-    changed = [np.load(tmp_path / name / "map.npz")["changed"] for name in ("near", "far")]
-    np.testing.assert_array_equal(*changed)
+    folders = tmp_path / "near", tmp_path / "far"
+    near.save(folders[0])
+    far.save(folders[1])
+    origins = [yaml.safe_load((one / "map.yaml").read_text())["origin"][:2] for one in folders]
+    np.testing.assert_allclose(np.subtract(*origins[::-1]), UTM[:2], atol=1e-8)
+    assert len({(one / "map.pgm").read_bytes() for one in folders}) == 1
+    np.testing.assert_array_equal(*(np.load(one / "map.npz")["changed"] for one in folders))
     _, written = read_tum(tmp_path / "far" / "trajectory.tum")
     np.testing.assert_allclose(written[:, :2, 3], shift(poses)[:, :2, 2], rtol=0, atol=1e-6)
     track = json.loads((tmp_path / "far" / "objects" / "objects.json").read_text())[0]["track"]
@@ -80,26 +78,23 @@ def test_a_planar_laser(room, tmp_path):
     assert again.map.origin == pytest.approx(far.map.origin, abs=1e-9)
 
 
+def points_of(folder):
+    return np.concatenate([block.points for block in cloud_from_folder(folder).iter_blocks()])
+
+
 def test_a_lidar(lidar, tmp_path):
     poses = from_zero(lidar.truth.T_world_base)
-    results = {
-        name: stillmap.build(lidar.recording, {"threads": 1}, poses=one)
-        for name, one in (("near", poses), ("far", shift(poses)))
-    }
-    require_shifted(results["far"], results["near"], 3)
-    for name, result in results.items():
-        result.save(tmp_path / name)
-    points = {
-        name: np.concatenate([b.points for b in cloud_from_folder(tmp_path / name).iter_blocks()])
-        for name in results
-    }
+    results, points = [], []
+    for name, kind in (("near", "float32"), ("far", "float64")):
+        given = poses if name == "near" else shift(poses)
+        results.append(stillmap.build(lidar.recording, {"threads": 1}, poses=given))
+        results[-1].save(tmp_path / name)
+        points.append(points_of(tmp_path / name))
+        fields = read_layout(tmp_path / name / "static.ply").fields
+        assert {str(one.dtype) for one in fields[:3]} == {kind}
+    require_shifted(*results[::-1], 3)
     # near ones are written with 32 bits
-    np.testing.assert_allclose(points["far"] - UTM, points["near"], rtol=0, atol=2e-5)
-    kinds = {
-        name: {str(one.dtype) for one in read_layout(tmp_path / name / "static.ply").fields[:3]}
-        for name in results
-    }
-    assert kinds == {"near": {"float32"}, "far": {"float64"}}
+    np.testing.assert_allclose(points[1] - UTM, points[0], rtol=0, atol=2e-5)
 
 
 def test_a_region_is_in_the_map_frame(room):
@@ -131,17 +126,14 @@ def test_clouds_in_a_map_projection(tmp_path):
     walls = rng.uniform(-8.0, 8.0, (4000, 3))
     walls[:2000, 0], walls[2000:, 1] = 8.0, -8.0
     (tmp_path / "clouds").mkdir()
-    table = np.zeros(len(walls), [(axis, "<f8") for axis in "xyz"])
-    for axis, column in zip("xyz", (walls + UTM).T, strict=True):
-        table[axis] = column
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(walls)}\n"
     head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
-    (tmp_path / "clouds" / "1.ply").write_bytes(head.encode() + table.tobytes())
+    xyz = (walls + UTM).astype("<f8").tobytes()
+    (tmp_path / "clouds" / "1.ply").write_bytes(head.encode() + xyz)
     recording = stillmap.read(tmp_path / "clouds")
     result = stillmap.build(recording, {"threads": 1})
     result.save(tmp_path / "out")
-    blocks = cloud_from_folder(tmp_path / "out").iter_blocks()
-    points = np.concatenate([block.points for block in blocks])
+    points = points_of(tmp_path / "out")
     apart, _ = cKDTree(walls).query(points - UTM)
     assert len(points) == len(walls)
     assert apart.max() < 1e-3

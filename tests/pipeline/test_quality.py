@@ -12,7 +12,6 @@ from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality, describe_quality, rate_quality
-from stillmap.results.folder import open_result
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.rematching import rematch_windows
@@ -97,13 +96,10 @@ def test_in_3d_drift_lowers_geometry_and_wrong_labels_lower_labels():
     drift = np.tile(np.eye(4), (48, 1, 1))
     drift[:, 1, 3] = 0.01 * np.arange(48)
     wrong = run.truth.static ^ (np.random.default_rng(0).random(len(hit)) < 0.1)
+    static = run.truth.static
     true, drifted, mislabelled = (
         rate_quality(recording, poses, labels.astype(np.float32), occupancy)
-        for poses, labels in (
-            (truth, run.truth.static),
-            (drift @ truth, run.truth.static),
-            (truth, wrong),
-        )
+        for poses, labels in ((truth, static), (drift @ truth, static), (truth, wrong))
     )
     assert true.geometry > drifted.geometry + 20.0
     assert true.labels > mislabelled.labels + 20.0
@@ -137,15 +133,7 @@ def test_views_to_one_side_are_not_matched_anew():
 
 
 def test_of_one_scan_nothing_can_be_told(run):
-    recording = dataclasses.replace(
-        run.recording,
-        stamp_ns=run.recording.stamp_ns[:1],
-        offset=run.recording.offset[:2],
-        points=run.recording.points[run.recording.beams_of(0)],
-        hit=run.recording.hit[run.recording.beams_of(0)],
-        sensor=run.recording.sensor[:1],
-        T_odom_base=None,
-    )
+    recording = run.recording.without_odometry().slice_scans(0, 1)
     occupancy = stillmap.build(recording, poses=np.eye(3)[None]).map
     p_static = np.ones(recording.n_beams, np.float32)
     quality = rate_quality(recording, np.eye(3)[None], p_static, occupancy)
@@ -156,7 +144,7 @@ def test_of_one_scan_nothing_can_be_told(run):
 
 
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio"])
-def test_run_json_has_it_and_it_is_read_again(room, tmp_path, estimator):
+def test_run_json_has_it(room, tmp_path, estimator):
     options = override(Options(), {"estimator": estimator, "threads": 1})
     result = stillmap.build(room.recording, options)
     assert 0.0 <= result.quality.labels <= 100.0
@@ -164,7 +152,6 @@ def test_run_json_has_it_and_it_is_read_again(room, tmp_path, estimator):
     written = json.loads((tmp_path / "out" / "run.json").read_text())["quality"]
     parts = ("overall", "labels", "geometry")
     assert written == {name: getattr(result.quality, name) for name in parts}
-    assert open_result(tmp_path / "out", "elsewhere").quality == result.quality
 
 
 def test_no_result_is_good_whose_labels_are_poor():

@@ -12,25 +12,10 @@ from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 
 # so short a way that there is something to close after a metre, and wheels that are believed
-CHOSEN = override(
-    Options(),
-    {
-        "threads": 1,
-        "em": {"max_iterations": 4, "held_out": 0},
-        "slam": {
-            "keyframe_distance": 0.3,
-            "odometry": {
-                f"{a}_per_{b}": 0.0
-                for a, b in (
-                    ("translation", "metre"),
-                    ("translation", "radian"),
-                    ("rotation", "metre"),
-                    ("rotation", "radian"),
-                )
-            },
-        },
-    },
-)
+ERRORS = (f"{a}_per_{b}" for a in ("translation", "rotation") for b in ("metre", "radian"))
+SLAM = {"keyframe_distance": 0.3, "odometry": dict.fromkeys(ERRORS, 0.0)}
+EM = {"max_iterations": 4, "held_out": 0}
+CHOSEN = override(Options(), {"threads": 1, "em": EM, "slam": SLAM})
 
 
 @pytest.fixture(autouse=True)
@@ -51,9 +36,8 @@ def test_from_the_third_on_poses_are_those_of_the_one_before_swept(leaping):
     before = None
     for it in stillmap.iterate(leaping, CHOSEN):
         start = before.estimate.m_step if it.estimate.number > 2 else None
-        mapped = slam.m_step(
-            leaping, it.estimate.weights, CHOSEN.slam, None, 1, lambda *_: None, initial=start
-        )
+        given = leaping, it.estimate.weights, CHOSEN.slam, None, 1, lambda *_: None
+        mapped = slam.m_step(*given, initial=start)
         np.testing.assert_array_equal(it.estimate.poses, mapped.poses)
         np.testing.assert_array_equal(it.estimate.m_step.covariance, mapped.covariance)
         before = it

@@ -32,12 +32,15 @@ def rig(tmp_path_factory):
     return path
 
 
+def command(*words):
+    return main([str(word) for word in (*words, *QUICK)])
+
+
 @pytest.fixture(scope="module")
 def mapped(rig, tmp_path_factory):
     """What comes of it."""
     out = tmp_path_factory.mktemp("mapped") / "out"
-    words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o", out, *QUICK)
-    assert main([str(word) for word in words]) == 0
+    assert command("map", rig / "horizontal", "--tilting", rig / "tilting", "-o", out) == 0
     return out
 
 
@@ -77,8 +80,8 @@ def test_the_planar_laser_may_come_in_parts(rig, mapped, tmp_path):
         window = TimeWindow(ReadOptions(start=seconds[first] or None, end=seconds[last]))
         parts.append(tmp_path / str(number))
         stillmap_folder.write(select_time(whole, window), parts[-1])
-    words = ("map", *parts[::-1], "--tilting", rig / "tilting", "-o", tmp_path / "out", *QUICK)
-    assert main([str(word) for word in words]) == 0
+    words = ("map", *parts[::-1], "--tilting", rig / "tilting", "-o", tmp_path / "out")
+    assert command(*words) == 0
     for name in ("beams/p_static.npy", "tilting/beams/p_static.npy", "static.ply"):
         assert (tmp_path / "out" / name).read_bytes() == (mapped / name).read_bytes()
 
@@ -117,7 +120,6 @@ def test_objects_have_a_height_and_points(mapped):
     flat = {one["id"] for one in json.loads((mapped / "objects/objects.json").read_text())}
     for one in objects:
         assert one["id"] in flat
-        assert len(one["size"]) == 3
         assert 0.05 < one["size"][2] < 2.1
         assert len(one["track"]["z"]) == len(one["track"]["x"])
         assert _vertices(mapped / f"tilting/objects/{one['id']:04d}.ply") == one["beams"] >= 3
@@ -125,7 +127,7 @@ def test_objects_have_a_height_and_points(mapped):
 
 
 def test_planar_result_is_unchanged(rig, mapped, tmp_path):
-    assert main(["map", str(rig / "horizontal"), "-o", str(tmp_path / "out"), *QUICK]) == 0
+    assert command("map", rig / "horizontal", "-o", tmp_path / "out") == 0
     for name in ("map.pgm", "beams/p_static.npy", "objects/objects.json", "trajectory.tum"):
         assert (tmp_path / "out" / name).read_bytes() == (mapped / name).read_bytes()
     assert not (tmp_path / "out/tilting").exists()
@@ -133,10 +135,9 @@ def test_planar_result_is_unchanged(rig, mapped, tmp_path):
 
 def refused(capsys, *words):
     """The one line with which the command refuses."""
-    assert main([str(word) for word in (*words, *QUICK)]) == 2
+    assert command(*words) == 2
     out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
+    assert (out, err.count("\n")) == ("", 1)
     return err
 
 

@@ -1,10 +1,11 @@
 """A box cuts what it should, and nothing else."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.pipeline import tilting
 from stillmap.pipeline.tilting import PlanarResult, apply_boxes, build_tilting
@@ -32,14 +33,10 @@ def walker(seconds, size=(0.6, 0.4)):
     )
 
 
-def flat_recording(points, offset, stamps=STAMPS):
+def flat_recording(points, offset):
     """Of a laser at the origin that stands."""
-    return of_one_sensor(
-        stamps,
-        np.asarray(offset, np.int64),
-        np.asarray(points, np.float32).reshape(-1, 2),
-        np.ones(int(offset[-1]), bool),
-    )
+    xy, hit = np.asarray(points, np.float32).reshape(-1, 2), np.ones(int(offset[-1]), bool)
+    return of_one_sensor(STAMPS, np.asarray(offset, np.int64), xy, hit)
 
 
 def standing():
@@ -75,10 +72,8 @@ def test_untracked_clusters_have_a_short_box():
     recording = flat_recording(points, offset)
     boxes = fit_boxes(recording, standing(), p_static, [], 0.7, 0.5)
     assert [box.object_id for box in boxes] == [-1]
-    assert boxes[0].contains(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1).tolist() == [
-        True,
-        False,
-    ]
+    held = boxes[0].contains(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1)
+    assert held.tolist() == [True, False]
     p_static[:] = 0.31  # P(dynamic) below 0.7
     assert not fit_boxes(recording, standing(), p_static, [], 0.7, 0.5)
 
@@ -104,15 +99,11 @@ def built(points, ms, objects):
     floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1)
     stamps = np.concatenate([[0], np.asarray(ms, np.int64) * MS])
     n = len(points)
-    recording = Recording(
-        stamp_ns=stamps,
-        offset=np.concatenate([[0], len(floor) + np.arange(n + 1)]).astype(np.int64),
-        points=np.concatenate([floor, np.asarray(points) - [0, 0, 1.0]]).astype(np.float32),
-        hit=np.ones(len(floor) + n, bool),
-        T_base_sensor=np.eye(4)[None] + np.eye(4, k=1)[None] * [[0], [0], [1.0], [0]],
-        sensor=np.zeros(n + 1, np.int32),
-        T_odom_base=None,
-    )
+    offset = np.concatenate([[0], len(floor) + np.arange(n + 1)]).astype(np.int64)
+    xyz = np.concatenate([floor, np.asarray(points) - [0, 0, 1.0]]).astype(np.float32)
+    at_base = of_one_sensor(stamps, offset, xyz, np.ones(len(xyz), bool))
+    mount = np.eye(4)[None] + np.eye(4, k=1)[None] * [[0], [0], [1.0], [0]]
+    recording = dataclasses.replace(at_base, T_base_sensor=mount)
     seen = flat_recording([[9.0, 9.0]], np.append(np.zeros(len(STAMPS)), 1))
     flat = PlanarResult(seen, standing(), np.full(1, 0.9, np.float32), objects)
     found = build_tilting(flat, recording, EmOptions(), use_evidence=False)
@@ -142,9 +133,8 @@ def test_evidence_and_boxes_multiply_their_odds(monkeypatch):
     share = 0.8
     static = np.array([share, share, 0.999, 0.3, share], np.float32)  # of which two are in no box
     core = BoxBeams(np.array([0, 2]), np.array([True, True]))
-    margin = BoxBeams(
-        np.array([0, 1]), np.array([False, False])
-    )  # the first is in the core of the other
+    # the first is in the core of the other
+    margin = BoxBeams(np.array([0, 1]), np.array([False, False]))
     found = apply_boxes(static, [core, margin], share)
     odds = 999 / 4 / 9
     np.testing.assert_allclose(found, [0.1, 0.25, odds / (1 + odds), 0.3, share], rtol=1e-4)

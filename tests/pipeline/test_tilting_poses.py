@@ -1,10 +1,12 @@
 """Poses between scans: exact where the motion is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core import se2
-from stillmap.core.recording import Recording
 from stillmap.pipeline import tilting_beams
 from stillmap.pipeline.tilting_beams import interpolate_poses, pose_recording
 
@@ -62,16 +64,10 @@ def seen_on_the_way(times):
     T[:, 2, 2] = T[:, 3, 3] = 1.0
     point = np.array([4.0, -1.0, 1.3, 1.0])
     points = (se2.inverse(T @ T_base_sensor) @ point)[:, :3]
-    return point[:3], Recording(
-        stamp_ns=stamps,
-        offset=np.array([0, len(times), 2 * len(times)]),
-        points=points.astype(np.float32),
-        hit=np.ones(len(ns), bool),
-        T_base_sensor=T_base_sensor[None],
-        sensor=np.zeros(2, np.int32),
-        T_odom_base=None,
-        beam_time=np.tile(times, 2).astype(np.float32),
-    )
+    offset, hit = np.array([0, len(times), 2 * len(times)]), np.ones(len(ns), bool)
+    late = np.tile(times, 2).astype(np.float32)
+    seen = of_one_sensor(stamps, offset, points.astype(np.float32), hit, beam_time=late)
+    return point[:3], dataclasses.replace(seen, T_base_sensor=T_base_sensor[None])
 
 
 def test_beams_end_at_the_point():
