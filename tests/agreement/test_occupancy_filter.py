@@ -58,10 +58,20 @@ def known(core):
     if isinstance(core, _core.SweepFilter3D):
         cells, p = core.known_cells()
         return dict(zip(map(tuple, cells.tolist()), p.tolist(), strict=True))
-    first, p = core.dense()
+    return in_tile(*core.dense())
+
+
+def in_tile(first, p):
+    """{cell: P(standing)} of an array that begins at a cell."""
     at = np.argwhere(~np.isnan(p))
-    cells = at[:, ::-1] + first
-    return dict(zip(map(tuple, cells.tolist()), p[tuple(at.T)].tolist(), strict=True))
+    cells = map(tuple, (at[:, ::-1] + first).tolist())
+    return dict(zip(cells, p[tuple(at.T)].tolist(), strict=True))
+
+
+def assert_same_standing(found, expected):
+    values = np.array([[found[cell], expected[cell]] for cell in found.keys() & expected.keys()])
+    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=2e-3)
+    return values[:, 1]
 
 
 def test_agrees_with_the_twin(scans):
@@ -71,9 +81,7 @@ def test_agrees_with_the_twin(scans):
     found, expected = known(core), plain.p_standing()
     both = found.keys() & expected.keys()  # some are passed by the threshold, up to rounding
     assert len(both) > 0.99 * len(found.keys() | expected.keys())
-    values = np.array([[found[cell], expected[cell]] for cell in both])
-    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=2e-3)
-    assert values[:, 1].std() > 0.05
+    assert assert_same_standing(found, expected).std() > 0.05
     labels = core.label(points, hit, offset, T, 0.9)
     np.testing.assert_allclose(labels, plain.label(points, hit, offset, T, 0.9), atol=2e-3)
     np.testing.assert_array_equal(np.isnan(labels), np.isnan(points).any(axis=1))
@@ -89,9 +97,7 @@ def test_changed_blocks_are_told_once(scans):
     assert len(np.unique(blocks, axis=0)) == len(blocks)
     told = {}
     for first, tile in zip(blocks, tiles, strict=True):
-        at = np.argwhere(~np.isnan(tile))
-        cells = map(tuple, (at[:, ::-1] + first).tolist())
-        told.update(zip(cells, tile[tuple(at.T)].tolist(), strict=True))
+        told |= in_tile(first, tile)
     assert told == known(core)
     assert len(core.take_changed_blocks(100)[0]) == core.changed_count == 0
     add_scans(core, room, [300])
@@ -227,8 +233,8 @@ def test_what_another_map_knows_counts_at_once():
 def test_sweeps_go_on_from_what_another_map_knows(a_room):
     room = a_room(3, 3, 0.4, 14, 60).beams
     points, hit, offset, T = room.arguments
-    ends = np.einsum("nij,nj->ni", np.repeat(T[:, :3, :3], np.diff(offset), axis=0), points)
-    ends += np.repeat(T[:, :3, 3], np.diff(offset), axis=0)
+    of_beams = np.repeat(T, np.diff(offset), axis=0)
+    ends = np.einsum("nij,nj->ni", of_beams[:, :3, :3], points) + of_beams[:, :3, 3]
     usable = ends[hit & np.isfinite(ends).all(axis=1)]
     cells = np.unique(np.floor(usable / room.resolution).astype(np.int64), axis=0)
     both = [make(kernels, 3, room.resolution) for kernels in (_core, reference)]
@@ -237,5 +243,4 @@ def test_sweeps_go_on_from_what_another_map_knows(a_room):
         add_scans(one, room, np.arange(len(T)))
     found, expected = known(both[0]), both[1].p_standing()
     assert found.keys() == expected.keys()
-    values = np.array([[found[cell], expected[cell]] for cell in found])
-    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=2e-3)
+    assert_same_standing(found, expected)

@@ -77,9 +77,7 @@ def shown(result, cells):
 def test_what_was_moved_left_one_place_and_came_to_another():
     for kind, stay in (("left", AWAY), ("came", HERE)):
         before, after = seconds(only(kind, stay))
-        assert before == pytest.approx(90.0, abs=2.0)
-        assert after == pytest.approx(90.0, abs=2.0)
-        assert before < after
+        assert 88.0 <= before < after <= 92.0
     taken = only("left", Stay(-2.6, -2.0))
     assert seconds(taken)[1] == pytest.approx(GONE, abs=2.0)
     assert len([one for one in built().mapping.changes if one.kind in ("came", "left")]) == 3
@@ -92,10 +90,8 @@ def test_the_map_is_that_of_its_state():
     assert (shown(built(), left.cells) < 0.2).mean() > 0.9
     assert (shown(most, came.cells) < 0.2).mean() > 0.9
     assert (shown(most, left.cells) > 0.65).mean() > 0.5
-    found, listed = (
-        [(one.kind, one.stamp_ns) for one in result.mapping.changes] for result in (most, built())
-    )
-    assert found == listed
+    listed = ([(one.kind, one.stamp_ns) for one in r.mapping.changes] for r in (most, built()))
+    assert operator.eq(*listed)
     for one in built().mapping.changes:
         if one.kind in ("came", "left"):  # in one state: corners that hold hardly any stay free
             shares = [(shown(result, one.cells) > 0.5).mean() for result in (most, built())]
