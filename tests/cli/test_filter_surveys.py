@@ -13,7 +13,7 @@ def las_file(path, version="1.4", point_format=7):
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(version=version, point_format=point_format)
     header.scales, header.offsets = np.full(3, 0.001), np.array([1.0, 2.0, 3.0])
-    header.generating_software, header.system_identifier = "by hand", "a lidar"
+    header.generating_software, header.system_identifier = b"Gel\xe4nde", "a lidar"
     header.file_source_id = 7
     header.add_extra_dim(laspy.ExtraBytesParams("ring", np.uint16, "a ring"))
     header.vlrs.append(laspy.VLR("someone", 17, "theirs", b"\1\2\3"))
@@ -25,7 +25,8 @@ def las_file(path, version="1.4", point_format=7):
     points["return_number"] = 1 + np.arange(N) % 3
     with path.open("wb") as file:
         compressed = path.suffix == ".laz"
-        with laspy.open(file, "w", header=header, do_compress=compressed, closefd=False) as writer:
+        options = {"do_compress": compressed, "closefd": False, "encoding_errors": "replace"}
+        with laspy.open(file, "w", header=header, **options) as writer:
             writer.write_points(points)
             if version == "1.4":
                 record = laspy.VLR("someone", 18, "behind", b"\4" * 70000)

@@ -161,7 +161,12 @@ def open_las_writer(path: Path, laspy: Any, header: Any, compressed: bool) -> It
     with _ErrorKeepingWriter(io.FileIO(path, "w")) as file:
         try:
             with laspy.open(
-                file, "w", header=header, do_compress=compressed, closefd=False
+                file,
+                "w",
+                header=header,
+                do_compress=compressed,
+                closefd=False,
+                encoding_errors="replace",  # names that are not ASCII stay bytes as they are
             ) as writer:
                 yield writer
         except Exception as error:
