@@ -108,11 +108,9 @@ def test_log_likelihood(beams, prior):
 
 def test_log_likelihood_of_another_map(beams):
     # a map of the other half of the beams: unknown cells, cells with m = 0 and with m = 1
-    M = len(beams.hit)
-    half = np.arange(M) < M // 2
-    seen = beams.with_(
-        points=np.where(half[:, None], beams.points, np.float32(np.nan)), e=np.round(beams.e)
-    )
+    points = beams.points.copy()
+    points[len(points) // 2 :] = np.nan
+    seen = beams.with_(points=points, e=np.round(beams.e))
     core, plain = seen.grid(_core), seen.grid(reference)
     terms = _core.log_likelihood(core, *beams.weighted, 0.8)
     expected = reference.log_likelihood(plain, *beams.weighted, 0.8)
@@ -134,12 +132,9 @@ def test_any_number_of_threads_gives_the_same_bits(beams):
 def test_any_order_of_scans_gives_the_same_bits(beams):
     whole, piecewise = beams.grid(_core), beams.empty_grid(_core)
     for t in range(len(beams.T_map_sensor) - 1, -1, -1):
-        a, b = beams.offset[t], beams.offset[t + 1]
-        one = np.array([0, b - a])
-        _core.add_beams(
-            piecewise, beams.points[a:b], beams.hit[a:b], beams.e[a:b], one,
-            beams.T_map_sensor[t : t + 1],
-        )  # fmt: skip
+        a, b = beams.offset[t : t + 2]
+        scan = beams.points[a:b], beams.hit[a:b], beams.e[a:b]
+        _core.add_beams(piecewise, *scan, np.array([0, b - a]), beams.T_map_sensor[t : t + 1])
     for a, b in zip(whole.dense(), piecewise.dense(), strict=True):
         assert (a == b).all()
     if beams.dimension == 2:  # the moments too

@@ -34,39 +34,19 @@ class World:
         half_widths = np.array([translation, translation, rotation])
         return retract(self.T, half_widths * np.random.default_rng(self.seed).uniform(-1, 1, 3))
 
+    def options(self, window):
+        sizes = {"window_translation": window[0], "window_rotation": window[1], "search_range": 2.0}
+        return {"sigma": self.sigma, "floor": FLOOR, "information_scale": GAIN, **sizes}
+
     def core_found(self, T_prior, information, window, starts=1, iterations=0):
-        return _core.register_scan(
-            self.core,
-            self.points,
-            self.weights,
-            T_prior,
-            information,
-            sigma=self.sigma,
-            radius=2,
-            floor=FLOOR,
-            unknown=0.05,
-            information_scale=GAIN,
-            max_iterations=iterations,
-            window_translation=window[0],
-            window_rotation=window[1],
-            search_range=2.0,
-            max_candidates=starts,
-        )
+        more = {"radius": 2, "unknown": 0.05, "max_iterations": iterations}
+        given = self.points, self.weights, T_prior, information
+        options = {**self.options(window), **more, "max_candidates": starts}
+        return _core.register_scan(self.core, *given, **options)
 
     def lattice(self, T_prior, information, window):
-        return reference.search_lattice(
-            self.plain,
-            self.points,
-            self.weights,
-            T_prior,
-            information,
-            sigma=self.sigma,
-            floor=FLOOR,
-            information_scale=GAIN,
-            window_translation=window[0],
-            window_rotation=window[1],
-            search_range=2.0,
-        )
+        given = self.points, self.weights, T_prior, information
+        return reference.search_lattice(self.plain, *given, **self.options(window))
 
 
 def information(kind, seed):
@@ -119,10 +99,8 @@ def test_more_candidates_are_never_worse(a_room, seed):
     world, window = World(a_room, seed), (0.5, 0.5)
     T_prior, Lambda = world.prior(*window), information("correlated", seed)
     for iterations in (0, 20):
-        costs = [
-            world.core_found(T_prior, Lambda, window, starts, iterations)[2]
-            for starts in (1, 3, 10)
-        ]
+        given = T_prior, Lambda, window
+        costs = [world.core_found(*given, starts, iterations)[2] for starts in (1, 3, 10)]
         assert costs[0] >= costs[1] >= costs[2]
 
 

@@ -123,9 +123,8 @@ def test_curvature_has_no_negative_part(beams, grids):
     kept, kinds = np.ones(1, np.float32), set()
     for y in ends.astype(np.float32):
         core = curvature_of(grids[0], y[None], kept, np.eye(3), sigma, 2)
-        plain = reference.registration_curvature(
-            grids[1], y[None], kept, np.eye(3), sigma, 2, FLOOR, UNKNOWN
-        )
+        given = y[None], kept, np.eye(3), sigma, 2, FLOOR, UNKNOWN
+        plain = reference.registration_curvature(grids[1], *given)
         np.testing.assert_allclose(core, plain, rtol=0, atol=1e-5 * sigma**-2)
         values = np.linalg.eigvalsh(plain[:2, :2])
         assert values.min() > -1e-6
@@ -138,9 +137,8 @@ def test_far_from_the_map(beams, grids):
     T = T.copy()
     T[0, -1] += 1000
     usable = np.isfinite(points).all(axis=1)
+    expected = -weights[usable].sum(dtype=float) * np.log(FLOOR + UNKNOWN)
     for k, g in zip((_core, reference), grids, strict=True):
         cost = k.registration_cost(g, points, weights, T, 0.2, 2, FLOOR, UNKNOWN)
-        assert cost == pytest.approx(
-            -weights[usable].sum(dtype=float) * np.log(FLOOR + UNKNOWN), rel=1e-6
-        )
+        assert cost == pytest.approx(expected, rel=1e-6)
         assert not k.registration_gradient(g, points, weights, T, 0.2, 2, FLOOR, UNKNOWN).any()

@@ -45,10 +45,8 @@ def test_agreement(beams, n_stops, end_margin):
         cells = np.array(list(beams.grid(reference).alpha), np.int64)
         some = cells[:: 1 + len(cells) // 5][:n_stops]
         options["stop_cells"] = np.ascontiguousarray(some)
-    for a, b in zip(
-        *(counted(k, beams, time_bin, dynamic, **options).dense(*box_of(beams)) for k in KERNELS),
-        strict=True,
-    ):
+    both = [counted(kernels, beams, time_bin, dynamic, **options) for kernels in KERNELS]
+    for a, b in zip(*(one.dense(*box_of(beams)) for one in both), strict=True):
         assert a.dtype == np.uint16
         assert a.max() > 2
         # chords of length zero, and cells left at the limit of trust
