@@ -136,7 +136,7 @@ def poses_by(
     """Poses (T, 3, 3) of the last M-step with these weights; static (M,) are the true labels."""
     if weights == "e":
         *_, last = stillmap.iterate(recording, options)
-        return last.poses
+        return last.estimate.poses
     if weights == "true labels" and static is not None:
         return poses_with(recording, options, static)
     prior = em.initial_p_static(recording, options.estimator, options.em)

@@ -79,7 +79,7 @@ def _scored(run: Run) -> Scores:
 
     begun = time.process_time()
     with (
-        mock.patch.object(final_map, "_find_doors", timed(final_map._find_doors)),
+        mock.patch.object(final_map, "find_doors", timed(final_map.find_doors)),
         mock.patch.object(final_map, "find_lone_doors", timed(final_map.find_lone_doors)),
     ):
         result = stillmap.build(

@@ -98,13 +98,11 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     flat = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
     tilting = rig.tilting.recording
     built = {
-        way: build_tilting(
-            flat, tilting, chosen.rig, chosen.objects, chosen.em, use_evidence=way == WAYS[1]
-        )
+        way: build_tilting(flat, tilting, chosen.em, use_evidence=way == WAYS[1])
         for way in WAYS[:2]
     }
     unlabelled = replace(flat, p_static=np.ones_like(flat.p_static), objects=[])
-    alone = build_tilting(unlabelled, tilting, chosen.rig, chosen.objects, chosen.em)
+    alone = build_tilting(unlabelled, tilting, chosen.em)
     return rig, alone.p_static, built
 
 

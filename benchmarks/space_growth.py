@@ -33,6 +33,7 @@ from stillmap.core import config
 from stillmap.core.profiling import StageTimer, peak_memory_bytes
 from stillmap.io import stillmap_folder
 from stillmap.pipeline.result import map_recording
+from stillmap.results.writer import save
 from stillmap.sim import SCENES, load_truth, scene_by_name, simulate, write_simulation
 
 Float = NDArray[np.float64]
@@ -116,7 +117,7 @@ def cost_of(
     result = map_recording(recording, chosen, poses=poses, stages=stages)
     models = stillmap.build_models(result, stages=stages) if with_models else None
     with stages.measure("writing"):
-        result.save(out, models=models)
+        save(result, out, models=models)
     took = {**result.stages, **stages.to_dict()}
     return {
         "seconds": (time.perf_counter() - wall) / sweeps,
