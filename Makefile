@@ -81,8 +81,8 @@ demo: $(VENV)/installed
 	@echo "map        demo/map/map.pgm, demo/map/map.yaml"
 	@echo "report     demo/map/report.html (open it in a browser)"
 
-# files side by side: what a file makes once for all its tests is made once
-SIDE_BY_SIDE := --numprocesses=auto --maxprocesses=4 --dist=loadfile
+# files side by side: what a file makes once for all its tests is made once; some wait for processes
+SIDE_BY_SIDE := --numprocesses=$(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --maxprocesses=4 --dist=loadfile
 
 # one thread of BLAS each: more would wait busily for the cores that the others use
 test: $(VENV)/tested

@@ -38,7 +38,7 @@ def test_new_labels_are_those_of_a_scan_that_is_added_anew():
     scan = MappedScan(beams, e, se2.matrix(1.3, -0.4, 0.7), 0.0)
     maps = LocalMap(0.05), LocalMap(0.05)
     maps[0].add(scan)
-    maps[0].tend(10**9, 0.0, lambda _: later)
+    maps[0].tend(10**9, 0.0, lambda _: later, 1)
     maps[1].add(replace(scan, e=later))
     assert counts(maps[0]) != counts(LocalMap(0.05))
     for cells in (maps[0].grid.block_cells, maps[1].grid.block_cells):
@@ -52,5 +52,24 @@ def test_scans_of_long_ago_leave():
         assert local_map.add(mapped(n))
         if n >= 10:
             last.add(mapped(n))
-    local_map.tend(0, 30.0, None)
+    local_map.tend(0, 30.0, None, 99)
     assert counts(local_map) == pytest.approx(counts(last))
+
+
+def test_work_that_is_due_is_spread_over_scans_until_it_is_late():
+    local_map, labelled = LocalMap(0.1), []
+
+    def label(scan):
+        labelled.append(scan.beams.stamp_ns)
+        return scan.e
+
+    for n in range(5):
+        local_map.add(mapped(n))
+    local_map.tend(1_400_000_000, 0.0, label, 1)
+    # due since 0.4 and 0.3 s: late; since 0.2 s: as many as may be
+    assert labelled == [0, 100_000_000, 200_000_000][: len(labelled)]
+    assert len(labelled) == 2
+    local_map.tend(1_400_000_000, 0.0, label, 1)
+    assert labelled[2:] == [200_000_000]
+    local_map.tend(1_400_000_000, 0.0, label, 9)
+    assert labelled[3:] == [300_000_000, 400_000_000]

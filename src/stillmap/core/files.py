@@ -226,13 +226,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def _remove_stale(output: Path) -> None:
-    """Remove work of processes that were killed long ago."""
+    """Remove work of processes that were killed long ago: nothing in it has changed since."""
     head = hidden_path(output, "").name
     with suppress(OSError):
         for entry in workplace(output).iterdir():
             is_work = entry.name.startswith(head) and _RANDOM.fullmatch(entry.name[len(head) :])
-            if is_work and time.time() - entry.lstat().st_mtime > _MAX_AGE:
+            if is_work and time.time() - _last_change(entry) > _MAX_AGE:
                 remove(entry)
+
+
+def _last_change(work: Path) -> float:
+    """Time of the last change in a file, or in a folder and all below it; s."""
+    return max(entry.lstat().st_mtime for entry in (work, *work.rglob("*")))
 
 
 @defer_signals

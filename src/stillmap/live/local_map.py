@@ -20,6 +20,7 @@ from stillmap.slam.types import LoopContext
 
 _LABELLED_AFTER_NS = 10**9  # after which scans are labelled again
 _MAX_TRAVEL = 25.0  # m after which scans leave
+_MAX_DELAY_NS, _MAX_DELAY = 250_000_000, 1.0  # ns and m by which both may be late
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +80,26 @@ class LocalMap:
         self._recent.append(scan)
         return True
 
-    def tend(self, stamp_ns: int, travelled: float, label: Labeller) -> None:
+    def tend(self, stamp_ns: int, travelled: float, label: Labeller, most: float) -> None:
         """Label scans again after a second, each once, and remove those of long ago.
 
         Args:
             stamp_ns: now.
             travelled: m of travel so far.
             label: labels an earlier scan by what is known by now.
+            most: scans for which this is done now, unless it is overdue.
         """
-        while self._recent and self._recent[0].beams.stamp_ns <= stamp_ns - _LABELLED_AFTER_NS:
+        due_ns, before = stamp_ns - _LABELLED_AFTER_NS, travelled - _MAX_TRAVEL
+        while self._recent and self._recent[0].beams.stamp_ns <= due_ns:
+            if most <= 0 and self._recent[0].beams.stamp_ns > due_ns - _MAX_DELAY_NS:
+                break
             self._relabel(self._recent.popleft(), label)
-        while self._scans and self._scans[0].travelled < travelled - _MAX_TRAVEL:
+            most -= 1
+        while self._scans and self._scans[0].travelled < before:
+            if most <= 0 and self._scans[0].travelled >= before - _MAX_DELAY:
+                break
             add_scan(self.grid, self._scans.popleft(), remove=True)
+            most -= 1
 
     def _relabel(self, scan: MappedScan, label: Labeller) -> None:
         at = next((k for k, mapped in enumerate(self._scans) if mapped is scan), None)

@@ -3,6 +3,7 @@
 Not in a thread: GTSAM holds Python's lock while it solves a pose graph.
 """
 
+import itertools
 import logging
 import os
 import pickle
@@ -14,6 +15,7 @@ import traceback
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -30,9 +32,10 @@ _TRIM_EVERY = 64  # scans after which the child gives freed memory back
 _SECONDS_TO_END = 5.0  # before the process is killed
 
 
-def send(stream: IO[bytes], message: Any) -> None:
-    """Write a message and flush."""
-    pickle.dump(message, stream, pickle.HIGHEST_PROTOCOL)
+def send(stream: IO[bytes], *messages: Any) -> None:
+    """Write messages and flush."""
+    for message in messages:
+        pickle.dump(message, stream, pickle.HIGHEST_PROTOCOL)
     stream.flush()
 
 
@@ -104,8 +107,11 @@ class LoopProcess:
     def _receive(self) -> None:
         assert self._process.stdout is not None
         with self._process.stdout as stdout:
-            for correction in receive(stdout):
-                self._incoming.append(correction)
+            messages = receive(stdout)
+            for correction, count in messages:
+                near = list(itertools.islice(messages, count))
+                if len(near) == count:  # else the process has ended amid them
+                    self._incoming.append(replace(correction, near=near))
 
 
 def make_closer(
@@ -136,7 +142,8 @@ def _close_loops(source: IO[bytes], target: IO[bytes]) -> None:
             trim_heap()
         closer.add(*message)
         if arrived.empty() and (correction := closer.poll()) is not None:
-            send(target, correction)
+            # scan by scan: all at once would be unpacked with Python's lock held
+            send(target, (replace(correction, near=[]), len(correction.near)), *correction.near)
             del correction
             trim_heap()
 

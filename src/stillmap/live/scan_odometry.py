@@ -1,5 +1,6 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +34,7 @@ _MIN_TRAVEL = 8.0  # m after which directions are known
 # normals of one wall share their errors: evidence of each; std of a building's walls about its
 # directions, rad, which one metre of travel shows once
 _EVIDENCE, _MIN_STD = 0.1, np.radians(0.3)
+_FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 # scans that contradict the map more than others agree, after which the robot was carried; at most
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
@@ -199,7 +201,8 @@ class ScanOdometry:
             return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
         added = self.local_map.add(replace(scan, e=recent))
-        self.local_map.tend(beams.stamp_ns, self.travelled, label)
+        most = math.inf if self._seconds >= _FAST else float(not added)
+        self.local_map.tend(beams.stamp_ns, self.travelled, label, most)
         return scan if added else None
 
     def enter(self, local_map: Any, T: Float) -> None:
