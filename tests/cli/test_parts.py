@@ -157,3 +157,12 @@ def test_sessions_are_refused_and_merge_named(call, room, day_after, tmp_path, n
     nothing_left("tuesday")
     both = json.loads(call("info", room, day_after, "--json").stdout)
     assert [one["scans"] for one in both["recordings"]] == [40, 40]
+
+
+def test_given_poses_are_those_of_all_parts(call, room, tmp_path):
+    parts = cut_folder(room, tmp_path)
+    assert call("map", room, "-o", tmp_path / "a", *QUICK).returncode == 0
+    poses = tmp_path / "a" / "trajectory.tum"
+    done = call("map", *parts, "-o", tmp_path / "b", "--poses", poses, *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "b" / "trajectory.tum").read_bytes() == poses.read_bytes()

@@ -117,3 +117,9 @@ def test_what_is_no_probability_or_fits_nothing_is_refused():
         scores([1.5], [1])
     with pytest.raises(ValueError, match="lengths differ"):
         score_labels(np.zeros(3), np.zeros(2, bool), np.zeros(3, bool))
+
+
+def test_average_precision_by_hand():
+    # scikit-learn's documented example has 0.8333...
+    score, positive = np.array([0.1, 0.4, 0.35, 0.8]), np.array([0, 0, 1, 1], bool)
+    assert compute_average_precision(score, positive) == pytest.approx(1 / 2 + 1 / 2 * 2 / 3)

@@ -192,3 +192,20 @@ def test_answers_do_not_depend_on_when_the_map_is_updated(corridor):
     np.testing.assert_array_equal(snapshot.p_static[-len(last.p_static) :], last.p_static)
     np.testing.assert_array_equal(snapshot.given[-1], last.pose)
     assert snapshot.recording.n_scans == count
+
+
+def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh, caplog):
+    mapper = fresh(background=True)
+    push_all(mapper, corridor.recording, 50)
+    process = mapper._slam.frame._closer._process
+    process.kill()
+    process.wait()
+    waiting = []
+    for t in range(50, 150):
+        update = mapper.push(corridor.beams[t], corridor.recording.T_odom_base[t])
+        waiting.append(mapper._slam.frame._closer._outgoing.qsize())
+    truth = corridor.truth.T_world_base
+    moved = se2.inverse(truth[0]) @ truth[149]
+    np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
+    assert sum("closes loops" in record.message for record in caplog.records) == 1
+    assert waiting[-1] <= waiting[10]  # nobody takes anything out
