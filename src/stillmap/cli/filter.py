@@ -94,7 +94,7 @@ def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> dict[s
     records = []
     with atomic_folder(output, _INDEX, args.overwrite) as folder:
         for name, (result, file, target) in zip(names, plans, strict=True):
-            record = _write_filtered(result, target, folder / file, file, args)
+            record = _write_filtered(result, target, folder / file, f"{name}: ", args)
             records.append({"name": name, "file": file, **record})
         write_json(folder / _INDEX, records)
     if not args.quiet:
