@@ -20,6 +20,7 @@ void bind_observation_counts(nanobind::module_& m);
 void bind_plane_projection(nanobind::module_& m);
 void bind_plane_registration(nanobind::module_& m);
 void bind_pose_refinement(nanobind::module_& m);
+void bind_shortest_paths(nanobind::module_& m);
 void bind_texel_raster(nanobind::module_& m);
 void bind_z_buffer(nanobind::module_& m);
 

@@ -26,6 +26,7 @@ NB_MODULE(_core, m) {
   stillmap::bindings::bind_plane_projection(m);
   stillmap::bindings::bind_plane_registration(m);
   stillmap::bindings::bind_pose_refinement(m);
+  stillmap::bindings::bind_shortest_paths(m);
   stillmap::bindings::bind_texel_raster(m);
   stillmap::bindings::bind_z_buffer(m);
 }

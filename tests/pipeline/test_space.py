@@ -126,7 +126,8 @@ def test_what_was_learned_is_of_all_classes(street, mapped):
     assert "put down or taken away" in " ".join(report.split())
     unasked = {k: v for k, v in mapped.learned.items() if k != "changing"}
     estimate = mapped.estimate.with_labels(learned=unasked)
-    assert "put down" not in render_report(dataclasses.replace(mapped, estimate=estimate))
+    mapping = dataclasses.replace(mapped.mapping, estimate=estimate)
+    assert "put down" not in render_report(dataclasses.replace(mapped, mapping=mapping))
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,11 +80,13 @@ class MappedPlace:
             mapping=mapping,
         )
 
-    def __getattr__(self, name: str) -> Any:
-        mapping = None if name.startswith("__") else self.__dict__.get("mapping")
-        if mapping is None:
-            raise AttributeError(f"a {type(self).__name__} has no {name}")
-        return getattr(mapping, name)
+    if not TYPE_CHECKING:  # a misspelt attribute is an error
+
+        def __getattr__(self, name: str) -> Any:
+            mapping = None if name.startswith("__") else self.__dict__.get("mapping")
+            if mapping is None:
+                raise AttributeError(f"a {type(self).__name__} has no {name}")
+            return getattr(mapping, name)
 
     @classmethod
     def open(cls, path: PathLike, recording: Source | None = None) -> Self:

@@ -4,8 +4,8 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-import scipy  # its parts load when they are first used
 
+import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
@@ -76,14 +76,10 @@ def _shortest_paths(
         return np.append(steps[::-1].cumsum()[::-1], 0.0)
     scans = np.array([[closure.earlier, closure.later] for closure in closures])[is_before]
     first, second = np.searchsorted(context.keyframes, scans).T
-    ends = np.stack([np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)])
+    ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
     # even where the robot stands a path through fewer keyframes is the shorter one
     weights = np.concatenate([steps, lengths[is_before]]).clip(1e-9)
-    order = np.argsort(weights)  # of edges between the same keyframes the shortest counts
-    ends, shortest = np.unique(np.sort(ends, axis=0)[:, order], axis=1, return_index=True)
-    row, column = ends
-    graph = scipy.sparse.csr_array((weights[order][shortest], (row, column)), shape=(k + 1, k + 1))
-    return np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=[k])[0])
+    return _core.shortest_paths(np.stack(ends, axis=1), weights, k + 1, k)
 
 
 def blind_stds(context: LoopContext, k: int, closures: list[LoopClosure]) -> tuple[Float, Float]:

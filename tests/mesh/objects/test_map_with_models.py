@@ -133,7 +133,7 @@ def test_damaged_pictures_are_told_of_and_others_paint_in_their_place(
     first, second = told["unread"]
     assert pictures[1].name in first
     assert pictures[4].name in second
-    assert f"2 images are not used, the first: {first}" in record["warnings"]
+    assert f"images that are not used: 2, {first}" in record["warnings"]
     # what paints is what was left; but for what only those two saw, all is painted as before
     image = np.load(out / "mesh_faces.npz")["image"]
     assert not np.isin(image, (1, 4)).any()
