@@ -1,7 +1,6 @@
 """Memory-mapped buffers for arrays larger than memory, `.npy` and `.npz` files, array helpers.
 
-Large arrays lie in unlinked temporary files, which vanish with the last reference even if the
-process is killed.
+Large arrays lie in unlinked temporary files, which vanish with the process even if it is killed.
 """
 
 import mmap
@@ -28,8 +27,7 @@ def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                     _write_array(file, array)
         except BaseException:
-            # close() would fail on the half-written array and hide the error
-            archive.fp = None
+            archive.fp = None  # close() would fail on the half-written array and hide the error
             raise
         archive.close()
 

@@ -157,7 +157,7 @@ class _Lines:
 
 
 def _describe(done: float, total: float, unit: str, seconds: float) -> str:
-    """How far a step is, in words."""
+    """Progress of a step as text: the count, its total, the rate and the time left."""
     if not total:
         return "begins"
     if isinstance(done, float):

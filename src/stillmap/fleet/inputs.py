@@ -50,7 +50,7 @@ def open_location(text: str) -> tuple[Any, str]:
 
 
 def is_local(text: str) -> bool:
-    """Whether a path or URL lies in the file system of this machine."""
+    """True if a path or URL is in the file system of this machine."""
     return "://" not in text or text.startswith("file://")
 
 
@@ -80,7 +80,7 @@ def explain(url: str, action: str) -> Iterator[None]:
 
 
 def list_files(url: str) -> dict[str, dict[str, Any]]:
-    """What fsspec knows of each file at and below a path or URL, by its name relative to it.
+    """The fsspec records of the files at and below a path or URL, by their names relative to it.
 
     Raises:
         InputError: there is nothing, it cannot be read, or a name would lead out of the folder.
@@ -141,12 +141,12 @@ def hash_content(url: str) -> tuple[str, int]:
 
 
 def is_component(name: str) -> bool:
-    """Whether a name from outside is one component of a path, and leads nowhere else."""
+    """True if a name from outside is a single path component, neither `.` nor `..`."""
     return name not in ("", ".", "..") and not any(c in "/\\\0" for c in name)
 
 
 def is_folder_name(name: str) -> bool:
-    """Whether a text is fit for a folder's name everywhere."""
+    """True if every file system accepts a text as the name of a folder."""
     plain = re.sub(r"[-_. ]", "", name)
     return plain.isalnum() and name[0] not in ".-" and len(name.encode()) <= 200
 

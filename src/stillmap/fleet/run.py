@@ -78,7 +78,7 @@ class Place(NamedTuple):
 
     @property
     def is_done(self) -> bool:
-        """Whether its result is there."""
+        """True if its result exists."""
         return self.outcome is not None and self.outcome.is_done
 
     @property

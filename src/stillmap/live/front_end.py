@@ -1,4 +1,4 @@
-"""What the front ends of live mapping, in 2D and 3D, tell: registered scans, and crowds."""
+"""Results of the front ends of live mapping, in 2D and 3D: registered scans, and crowds."""
 
 from collections import deque
 from dataclasses import dataclass

@@ -222,7 +222,7 @@ class MapFrame:
 
     @contextmanager
     def _while_disk_lasts(self) -> Iterator[LoopClosing | None]:
-        """What closes loops, which ends where the disk is full: no scan can be kept for later."""
+        """The loop closer; it ends when the disk is full, since no scan can be kept for later."""
         try:
             yield self._closer
         except OSError as error:

@@ -284,7 +284,7 @@ class ScanOdometry:
     def _detect_fault(
         self, beams: ScanBeams, scan: Scan, prior: MotionPrior, match: ScanMatch
     ) -> Fault | None:
-        """What is wrong with odometry; scans since then are removed from the local map."""
+        """The fault of odometry, if any; scans since it began are removed from the local map."""
         has_map = self.local_map.has_sensor(beams.sensor) and not self._contradictions
         fault = self._faults.detect(
             self.local_map.grid,

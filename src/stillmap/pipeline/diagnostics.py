@@ -66,7 +66,7 @@ def find_map_warnings(maps: Maps, recording: Recording, poses: Float) -> list[st
 
 
 def _input_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
-    """What was left out, and that there is no odometry."""
+    """Warnings about scans and beams that were left out, and about missing odometry."""
     if skipped := recording.source.n_skipped:
         were = "were" if skipped > 1 else "was"
         why = "left out while reading (`stillmap info` says why)"

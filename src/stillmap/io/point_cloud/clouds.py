@@ -355,6 +355,6 @@ def _to_3d(points: NDArray[Any]) -> NDArray[Any]:
 
 
 def describe_non_returns(recording: Recording) -> list[str]:
-    """What clouds lack of a recording, a sentence each."""
+    """A sentence on the beams without a return, which clouds cannot hold; none if all returned."""
     n = recording.n_beams - int(np.count_nonzero(recording.hit))
     return [f"{n} beams without a return are left out"] if n else []

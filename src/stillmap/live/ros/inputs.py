@@ -1,4 +1,4 @@
-"""What ROS says, as our own types: parameters and messages, and arrays for messages; no ROS in it.
+"""ROS parameters and messages as types of stillmap, and arrays for messages; imports no ROS.
 
 Names and meanings of parameters are those of slam_toolbox and nav2.
 """
