@@ -1,6 +1,7 @@
 """Entry point of `stillmap`: parse, run one command, turn errors into exit statuses."""
 
 import argparse
+import ctypes
 import io
 import logging
 import os
@@ -25,6 +26,7 @@ from stillmap.core.errors import (
 )
 
 EXIT_DEFECT = 1
+_M_ARENA_MAX, _HEAPS = -8, 2  # parameter of glibc's mallopt, and heaps for all threads
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -35,6 +37,7 @@ def main(argv: list[str] | None = None) -> int:
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
         handle_signals(main.__code__)
+        _share_heaps()
         status: int = args.run(args)
         if sys.stdout is not None:  # None: closed before the start
             sys.stdout.flush()
@@ -43,6 +46,14 @@ def main(argv: list[str] | None = None) -> int:
         return _report_failure(error)
     except KeyboardInterrupt:
         return _report_interrupt()
+
+
+def _share_heaps() -> None:
+    """Let threads share heaps: each keeps freed blocks, and glibc makes one for each thread."""
+    if sys.platform == "linux":
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        if mallopt is not None:
+            mallopt(_M_ARENA_MAX, _HEAPS)
 
 
 def _report_failure(error: Exception) -> int:
