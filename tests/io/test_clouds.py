@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from peak_memory import run_measured
 
 from stillmap.core.errors import InputError
 from stillmap.core.source import Skipped
@@ -121,6 +122,31 @@ def test_chunks_that_are_not_there_do_not_end_the_process(survey):
     survey.write_bytes(content)
     with pytest.raises(InputError, match="table of chunks"):
         read(survey)
+
+
+def test_layers_that_are_not_there_take_no_memory(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    path = tmp_path / "a.laz"
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    with laspy.open(path, "w", header=header) as writer:
+        writer.write_points(laspy.ScaleAwarePointRecord.zeros(30, header=header))
+    content = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", content, 96)
+    # after the first point and the count of points: bytes of the second layer
+    struct.pack_into("<I", content, start + 8 + 30 + 4 + 4, 2**32 - 1)
+    path.write_bytes(content)
+    code = """
+import sys
+from stillmap.core.errors import InputError
+from stillmap.io import read
+try:
+    read(sys.argv[1])
+except InputError as error:
+    print(error)
+"""
+    said, peak = run_measured(code, path)
+    assert said == [f"{path}: is damaged: the sizes of its layers"]
+    assert peak < 500
 
 
 @pytest.mark.parametrize(("name", "start"), [("a.las", b"LASF"), ("a.e57", b"ASTM-E57")])

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import date
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +29,11 @@ EXTENSIONS, MAGIC = (".las", ".laz"), b"LASF"
 
 _BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points and bytes read at once
 _MAX_POINTS_PER_BYTE, _MIN_POINT_LIMIT = 20, 10_000_000  # compressed points take a byte or more
-_HEADER = 227  # bytes of the smallest header
+_HEADER, _MIN_POINT = 227, 20  # bytes of the smallest header, and of the smallest point
 _COMPRESSED = 0xC0  # bits of the point format
+_LAYERED = 3  # compressor of the formats from 6 on: the columns of a chunk are layers
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of a point, colors, infrared and wave packets
+_BYTES = 14  # extra bytes, a layer each
 SCALE = 0.0001  # m, coordinate step of written files
 MAX_INTEGER = 2**31 - 1  # of a coordinate in steps
 
@@ -60,14 +63,19 @@ def open_las_reader(path: Path) -> Iterator[Any]:
     Raises:
         InputError: it is no LAS file, damaged, or laspy or lazrs is missing.
     """
-    _check_header(path)
     laspy = import_extra("laspy", path)
-    # single-threaded: the parallel backend trusts chunk sizes
-    backend = laspy.LazBackend.Lazrs
-    with InputFile(path) as file:
+    with open_table(path) as file:
+        table = _check_header(file, path)
+        # single-threaded: the parallel backend trusts chunk sizes
+        backend = laspy.LazBackend.Lazrs
+        file.seek(0)
         with library_errors(path):
             reader = laspy.open(file, closefd=False, read_evlrs=False, laz_backend=backend)
         with closing(reader):
+            if table is not None:
+                at = file.tell()
+                _check_layers(file, reader.header, table, path)
+                file.seek(at)
             yield reader
 
 
@@ -89,38 +97,61 @@ def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
             yield block
 
 
-def _check_header(path: Path) -> None:
-    """Refuse header counts on which the libraries would run out of time or memory.
+def _check_header(file: InputFile, path: Path) -> int | None:
+    """Where the table of chunks of a compressed file begins; None: it is not compressed.
 
     Raises:
-        InputError: the header is invalid, or lazrs is missing.
+        InputError: the libraries would run out of time or memory, or lazrs is missing.
     """
-    with open_table(path) as file:
-        size, head = file.size, file.read(_HEADER)
-        if len(head) < _HEADER or head[:4] != MAGIC:
-            raise InputError("is no LAS file", where=str(path))
-        header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
-        # a variable length record has at least 54 bytes
-        if not header_size + 54 * extras <= start <= size:
-            raise InputError("is damaged: its header", where=str(path))
-        if kind & _COMPRESSED:
-            import_extra("lazrs", path)
-        # the first point of a chunk, of 20 bytes, is not compressed
-        if kind & _COMPRESSED and _count_chunks(file, start, size) > size // 20:
-            raise InputError("is damaged: its table of chunks", where=str(path))
+    head = file.read(_HEADER)
+    if len(head) < _HEADER or head[:4] != MAGIC:
+        raise InputError("is no LAS file", where=str(path))
+    header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
+    # a variable length record has at least 54 bytes
+    if not header_size + 54 * extras <= start <= file.size:
+        raise InputError("is damaged: its header", where=str(path))
+    if not kind & _COMPRESSED:
+        return None
+    import_extra("lazrs", path)
+    table = _read_number(file, start, 8)
+    if table == 2**64 - 1:  # streamed: the offset is at the end of the file
+        table = _read_number(file, file.size - 8, 8)
+    # the first point of a chunk is not compressed
+    is_inside = start <= table <= file.size - 8
+    if not is_inside or _read_number(file, table + 4, 4) > file.size // _MIN_POINT:
+        raise InputError("is damaged: its table of chunks", where=str(path))
+    return table
 
 
-def _count_chunks(file: IO[bytes], start: int, size: int) -> int:
-    """Chunk count of a compressed file, as stated in it."""
-    file.seek(start)
-    table = int.from_bytes(file.read(8), "little", signed=True)
-    if table == -1:  # streamed: the offset is at the end of the file
-        file.seek(size - 8)
-        table = int.from_bytes(file.read(8), "little", signed=True)
-    if not start <= table <= size - 8:
-        return size  # no chunk table
-    file.seek(table + 4)
-    return int.from_bytes(file.read(4), "little")
+def _check_layers(file: InputFile, header: Any, table: int, path: Path) -> None:
+    """Refuse chunks whose layers do not fill the file up to the table: lazrs makes room for as many
+    bytes as each layer states.
+
+    Raises:
+        InputError: they are longer or shorter.
+    """
+    with library_errors(path):
+        record = header.vlrs.get("LasZipVlr")[0].record_data
+        compressor, n_items = struct.unpack_from("<H30xH", record)
+        if compressor != _LAYERED:
+            return
+        items = np.frombuffer(record, "<u2", 3 * n_items, 34).reshape(-1, 3).astype(int)
+        layers = sum(size if kind == _BYTES else _LAYERS[kind] for kind, size, _ in items.tolist())
+        at, point = header.offset_to_point_data + 8, int(items[:, 1].sum())
+        if point < _MIN_POINT:
+            raise ValueError(f"a point of {point} bytes")
+        while at < table:
+            file.seek(at + point)
+            # the count of the points, then the bytes of each layer
+            sizes = struct.unpack(f"<{1 + layers}I", file.read(4 + 4 * layers))
+            at = file.tell() + sum(sizes[1:])
+    if at > table:
+        raise InputError("is damaged: the sizes of its layers", where=str(path))
+
+
+def _read_number(file: InputFile, at: int, size: int) -> int:
+    file.seek(at)
+    return int.from_bytes(file.read(size), "little")
 
 
 def write(recording: Recording, path: Path, poses: Float) -> None:
