@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from result_contents import contents
 
 from stillmap.cli.main import main
@@ -155,6 +156,20 @@ def test_another_recording_is_refused(call, room, tmp_path, interrupted):
     assert done.returncode == 2
     assert "another recording" in done.stderr
     assert interrupted.exists()
+
+
+def test_result_of_another_recording_is_not_replaced(call, room, tmp_path, whole):
+    out, other = tmp_path / "out", tmp_path / "other"
+    shutil.copytree(whole, out)
+    shutil.copytree(room, other)
+    hit = np.load(other / "hit.npy")
+    hit[77] = not hit[77]
+    np.save(other / "hit.npy", hit)
+    done = call("map", other, "-o", out, "--resume", *WORDS)
+    refused(done, f"{out}: holds the result of another recording", "--overwrite")
+    assert contents(out) == contents(whole)
+    shutil.copytree(room, tmp_path / "room")  # the same one elsewhere
+    assert call("map", tmp_path / "room", "-o", out, "--resume", *WORDS).returncode == 0
 
 
 def test_moved_recording_resumes_with_other_threads(call, room, tmp_path, interrupted, whole):

@@ -2,6 +2,7 @@
 
 import io
 import re
+import time
 
 import pytest
 from maps import ENDLESS
@@ -120,6 +121,16 @@ def test_lines_of_long_steps(lines, monkeypatch):
     )
     assert re.fullmatch(r"choosing pictures: 3 of 12, \d+ s left", lines[1])
     assert lines[2:] == ["labelling beams, iteration 1/6: begins", "reading: 50 %"]
+
+
+def test_silent_step_is_named_again(lines, monkeypatch):
+    monkeypatch.setattr(profiling, "_SILENT_PERIOD", 0.05)
+    with console.show_progress(False, 2) as progress:
+        progress("labelling beams", 1, 0, 0)
+        deadline = time.monotonic() + 20.0
+        while len(lines) < 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert re.fullmatch(r"labelling beams, iteration 1/2: \d+ s so far", lines[1])
 
 
 def test_short_iteration_is_reported_once(lines):

@@ -131,3 +131,11 @@ WIDE = {"fov": math.radians(270), "beams": 271}
 def test_wherever_a_laser_sits_poses_are_as_good(mapped, good, lasers, params, flipped, options):
     placed = {kind: seen(**mount) for kind, mount in lasers.items()}
     assert mapped(placed, params, flipped, **options) < good
+
+
+def test_first_scan_of_a_second_laser_is_no_misfit():
+    """It looks where the first laser has not been: what it shows is not in the map yet."""
+    options = {"laser": {"second_laser": True}, "robot": {"scans": 60}}
+    recording = simulate(scene_by_name("office", options), 3).recording
+    result = stillmap.build(recording, options={"em.max_iterations": 1})
+    assert not [warning for warning in result.warnings if "badly" in warning]

@@ -3,7 +3,7 @@
 import argparse
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from stillmap.cli.console import print_json, say, show_progress
 from stillmap.core.errors import InputError, is_out_of_memory, memory_error
 
 if TYPE_CHECKING:
+    from stillmap.core.recording import Recording
     from stillmap.pipeline.checkpoint import CheckpointFolder
 
 DESCRIPTION = (
@@ -65,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
         with stages.measure("read"):
             inputs = read_inputs(args, options, checkpoints.folder)
+        if args.resume and not args.overwrite and checkpoints.newest is None:
+            _require_own_result(args, output, inputs.recording)
         with show_progress(args.quiet, options.em.max_iterations) as progress:
             result, tilting, models = build_all(args, inputs, checkpoints, progress, stages)
             progress("writing", 0, 0, 0)
@@ -86,6 +89,26 @@ def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
     require_new(output, RECORD, args.overwrite or args.resume)
     for source in filter(None, (*args.input, args.tilting)):
         require_apart(output, Path(source))
+
+
+def _require_own_result(args: argparse.Namespace, output: Path, recording: "Recording") -> None:
+    """Refuse to replace the result of another recording: `--resume` goes on, `--overwrite` replaces.
+
+    Raises:
+        InputError: `output` is one.
+    """
+    from stillmap.results.folder import match_labels, open_result
+    from stillmap.results.reader import is_result, read_labels
+
+    if not is_result(output):
+        return
+    with suppress(InputError):
+        sources = {path.resolve() for path in open_result(output).sources}
+        if sources != {Path(path).resolve() for path in args.input}:  # it may have been moved
+            match_labels(recording, read_labels(output), "")
+        return
+    what, hint = "holds the result of another recording", "choose another or give overwrite=True"
+    raise InputError(what, where=str(output), hint=hint)
 
 
 @contextmanager

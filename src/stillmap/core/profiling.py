@@ -3,6 +3,7 @@
 import os
 import resource
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -13,6 +14,7 @@ from typing import IO, Any, Protocol
 Progress = Callable[[str, int, int, int], None]
 
 _LINE_PERIOD = 10.0  # s between lines of progress without a terminal
+_SILENT_PERIOD = 30.0  # s between lines of a step that says nothing
 _STAGE = ("seconds", "cpu_seconds", "peak_memory_bytes")
 
 
@@ -94,7 +96,8 @@ def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
         with _show_bar() as show:
             yield show
     else:
-        yield _Lines(say).update
+        with _Lines(say).watch() as show:
+            yield show
 
 
 @contextmanager
@@ -137,12 +140,16 @@ def _show_bar() -> Iterator[Show]:
 
 
 class _Lines:
-    """Prints progress every `_LINE_PERIOD` seconds, and once when scans of an iteration end."""
+    """Prints progress every `_LINE_PERIOD` seconds, and once when scans of an iteration end.
+
+    A step that says nothing for `_SILENT_PERIOD` seconds is named again, by a thread of its own.
+    """
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
         self._step = self._ended = ""
         self._started = self._printed = time.monotonic()
+        self._is_over = threading.Event()
 
     def update(self, step: str, done: float, total: float, unit: str = "") -> None:
         now = time.monotonic()
@@ -154,6 +161,24 @@ class _Lines:
             self._printed = now
             self._ended = iteration if is_end else self._ended
             self._say(f"{step}: {_describe(done, total, unit, now - self._started)}")
+
+    @contextmanager
+    def watch(self) -> Iterator[Show]:
+        """The function `update`; meanwhile steps that say nothing are named."""
+        watcher = threading.Thread(target=self._name_silent_steps, daemon=True)
+        watcher.start()
+        try:
+            yield self.update
+        finally:
+            self._is_over.set()
+            watcher.join()
+
+    def _name_silent_steps(self) -> None:
+        while not self._is_over.wait(_SILENT_PERIOD / 10.0):
+            now = time.monotonic()
+            if self._step and now - self._printed >= _SILENT_PERIOD:
+                self._printed = now
+                self._say(f"{self._step}: {now - self._started:.0f} s so far")
 
 
 def _describe(done: float, total: float, unit: str, seconds: float) -> str:

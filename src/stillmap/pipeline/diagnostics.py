@@ -1,5 +1,6 @@
 """Warnings of a run: what limits the trust in its result, where, and what to do about it."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -31,6 +32,7 @@ def find_warnings(
         *_odometry_warnings(best),
         *_length_warnings(best),
         *_place_warnings(best),
+        *_fit_warnings(best, recording),
     ]
 
 
@@ -127,7 +129,7 @@ def _length_warnings(best: Estimate) -> Iterator[str]:
 
 
 def _place_warnings(best: Estimate) -> Iterator[str]:
-    """That the robot was carried elsewhere, may be at another place, or fits the map badly."""
+    """That the robot was carried elsewhere, or may be at another place."""
     found = best.m_step.diagnostics
     for scan in found.ambiguous:
         yield advise(
@@ -147,7 +149,18 @@ def _place_warnings(best: Estimate) -> Iterator[str]:
             "record again so that the robot ends where it was before, or map the part before and "
             "the part after on their own",
         )
-    lost = np.flatnonzero(best.m_step.explained < _LOST)
+
+
+def _fit_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
+    """That scans fit the map badly; not the first of a laser: others may have looked elsewhere."""
+    is_lost = best.m_step.explained < _LOST
+    starts = [0, *best.m_step.diagnostics.breaks, recording.n_scans]
+    for first, end in itertools.pairwise(starts):
+        _, of_sensor, n = np.unique(
+            recording.sensor[first:end], return_index=True, return_counts=True
+        )
+        is_lost[first + of_sensor[n > 1]] = False  # of a sensor that moves, each scan is the first
+    lost = np.flatnonzero(is_lost)
     if len(lost):
         yield advise(
             f"{_count_scans(len(lost))} fit{'s' * (len(lost) == 1)} the map badly (less than a "

@@ -168,6 +168,7 @@ def map_recording(
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
     frame, odometry, recording, poses = enter_local_frame(recording, poses)
+    progress("calibrating", 0, 0, 0)
     with stages.measure("calibration"):
         recording, options, calibration, notes = correct_recording(recording, options, poses)
     state = resume or EmState(options)
