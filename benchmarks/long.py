@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from tables import markdown
 
 from stillmap.core import se2
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io import stillmap_folder

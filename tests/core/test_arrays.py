@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import arrays
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.source import Source
 from stillmap.io import builder
 from stillmap.io.builder import RecordingBuilder

@@ -92,7 +92,7 @@ def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
 
 
 def _require_own_result(args: argparse.Namespace, output: Path, recording: "Recording") -> None:
-    """Refuse to replace the result of another recording: `--resume` goes on, `--overwrite` replaces.
+    """Refuse to replace the result of another recording; `--overwrite` does.
 
     Raises:
         InputError: `output` is one.

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Index, Int64
-from stillmap.core.arrays import ArrayBuilder, empty, squared_lengths
+from stillmap.core.arrays import empty, squared_lengths
 from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.core.source import Skipped, Source

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.core.recording import Recording

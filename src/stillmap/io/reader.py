@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Int32
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import Part, SensorNotes, Skipped, Source

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from stillmap.core.array_builder import GrowingArray
 from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.array_types import Float, Float32
-from stillmap.core.arrays import GrowingArray
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.recording import Recording
 from stillmap.core.source import LaserPose, SensorNotes, Source

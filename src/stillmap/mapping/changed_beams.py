@@ -8,8 +8,8 @@ import numpy as np
 
 from stillmap import em
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW

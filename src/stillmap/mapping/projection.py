@@ -13,8 +13,9 @@ import numpy as np
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import se2
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
-from stillmap.core.arrays import ArrayBuilder, unique_cells
+from stillmap.core.arrays import unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import adjacent_pairs, component_labels

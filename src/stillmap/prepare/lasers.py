@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
-from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
+from stillmap.core.arrays import release_pages, release_periodically
 from stillmap.core.recording import Recording
 from stillmap.core.source import RangeRule, Source
 from stillmap.prepare import max_range

@@ -8,8 +8,9 @@ from typing import Literal
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float
-from stillmap.core.arrays import ArrayBuilder, write_npy
+from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32, Index
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 

@@ -9,8 +9,8 @@ import numpy as np
 import pydantic
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Float32, Index, Int64
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.config import STRICT, option
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr

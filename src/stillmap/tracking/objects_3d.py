@@ -9,8 +9,9 @@ import dataclasses
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Float32, Index, Int64
-from stillmap.core.arrays import ArrayBuilder, take_rows, unique_cells
+from stillmap.core.arrays import take_rows, unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import component_labels, neighbor_pairs

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS

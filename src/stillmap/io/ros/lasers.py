@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32, Int64
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, advise
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import longest_non_decreasing
