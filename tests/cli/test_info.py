@@ -186,3 +186,19 @@ def test_poses_and_images(path, tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
     assert (found["images"]["count"], found["images"]["cameras"][1]["count"]) == (5, 2)
+
+
+def test_what_is_left_out_of_parts_that_overlap(tmp_path, capsys):
+    scans = [f"FLASER 2 1 2 {x} 0 0 {x} 0 0 {100 + x} host 0.1\n" for x in range(9)]
+    names = [tmp_path / "a.log", tmp_path / "b.log", tmp_path / "elsewhere.log"]
+    for path, part in zip(names, (scans[:5], scans[3:], scans), strict=True):
+        path.write_text("".join(part))
+    assert run(*names[:2]) == 0
+    ending = capsys.readouterr().out.rpartition("as one run")[2]
+    assert re.search("scans +10\n +skipped\n +time running backwards +count 1, lines 5", ending)
+    assert run(*names[:2], "--json") == 0
+    found = json.loads(capsys.readouterr().out)["as_one_run"]
+    assert found["scans"] == 10
+    assert found["skipped"] == {"time running backwards": {"count": 1, "lines": [5]}}
+    assert run(names[0], names[2]) == 0  # no parts of one run
+    assert "as one run" not in capsys.readouterr().out

@@ -21,6 +21,8 @@ def run_command(words):
         inputs = [Path(word) for word in words[1 : words.index("-o")]]
         if "refuse" in str(output):
             raise InputError("fewer than two sessions fit")
+        if output.name == "full":
+            raise OSError(errno.ENOSPC, "No space left on device", str(output))
         # as merging does, which reads the recordings again
         recordings = [json.loads((path / "run.json").read_text())["input"] for path in inputs]
         texts = [Path(recording["path"]).read_text() for recording in recordings]

@@ -2,6 +2,8 @@
 
 import json
 import os
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 from fleet_processes import NAMES
@@ -107,6 +109,38 @@ def test_manifest_and_missing_object(stand_in, s3, tmp_path):
     done = stand_in("--manifest", "s3://robots/logs/m.csv", "-o", tmp_path / "out", "--quiet")
     assert done.returncode == 3
     assert done.stderr == "stillmap: b: s3://robots/logs/b.clf: does not exist\n"
+
+
+def test_a_bucket_without_access(stand_in, s3, monkeypatch, tmp_path):
+    class Forbidden(BaseHTTPRequestHandler):
+        def answer(self):
+            body = b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>"
+            self.send_response(403)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(body)
+
+        do_GET = do_HEAD = do_PUT = do_POST = answer
+
+        def log_message(self, *_):
+            pass
+
+    fill(s3, a="fine")
+    log = tmp_path / "a.clf"
+    log.write_text("fine")
+    with ThreadingHTTPServer(("127.0.0.1", 0), Forbidden) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+        s3fs.S3FileSystem.clear_instance_cache()
+        for words in (("s3://robots/logs", "-o", tmp_path / "out"), (log, "-o", "s3://robots/out")):
+            done = stand_in(*words, "--quiet")
+            assert done.returncode == 2
+            (line,) = done.stderr.splitlines()
+            assert "s3://robots/" in line
+            assert "Access Denied" in line or "Forbidden" in line
+        server.shutdown()
+    s3fs.S3FileSystem.clear_instance_cache()
 
 
 def test_missing_library():

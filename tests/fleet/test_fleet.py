@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import sys
 
 import pytest
 
@@ -189,6 +190,23 @@ def test_full_disk_stops_the_fleet_with_one_line(stand_in, logs, tmp_path):
     assert not (out / "fleet.json").exists()
     (folder / "b.clf").write_text("fine")
     assert stand_in(folder, "-o", out, "--quiet").returncode == 0
+    manifest = tmp_path / "m.csv"
+    manifest.write_text("".join(["input,place\n", *(f"{folder}/{x}.clf,full\n" for x in "ab")]))
+    done = stand_in("--manifest", manifest, "-o", out, "--quiet")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("stillmap: full: cannot continue: ")
+    assert os.listdir(out / "places") == []
+
+
+@pytest.mark.parametrize("missing", ["distributed", "cryptography", "fsspec"])
+def test_a_missing_library_is_named_in_one_line(call, logs, tmp_path, monkeypatch, missing):
+    monkeypatch.setitem(sys.modules, missing, None)
+    done = call("fleet", logs(a="fine"), "-o", tmp_path / "out", "--jobs", 1, "--quiet")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"needs {missing} to be run" in line or f"needs {missing} to be read" in line
+    assert "pip install '.[fleet]'" in line
 
 
 def test_two_fleets_in_one_folder(stand_in, logs, tmp_path):

@@ -12,7 +12,7 @@ Fields = tf2_ros.Fields
 
 
 class Marker(Fields):
-    ARROW, CYLINDER, TEXT_VIEW_FACING, DELETE = 0, 3, 9, 2
+    ARROW, CYLINDER, DELETEALL = 0, 3, 3
 
 
 class PointField(Fields):

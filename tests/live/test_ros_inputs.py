@@ -64,7 +64,7 @@ def test_without_ros_one_line_says_how_to_get_it(tmp_path, capsys):
     arguments = ["live", "-o", str(tmp_path / "out"), "--ros-args", "--params-file", "my.yaml"]
     assert main(arguments) == 2
     line = capsys.readouterr().err
-    assert "rclpy is not in this environment" in line
+    assert "No module named 'rclpy'" in line
     assert "source /opt/ros/" in line
     assert line.count("\n") == 1
 
@@ -75,7 +75,7 @@ INF, NAN = math.inf, math.nan
 
 def test_readings_become_beams_in_their_order():
     message = laser_scan(5_000_000_007, [2.0, INF, 25.0, NAN, 0.05, 1.0])
-    beams = messages.to_scan_beams(message, "scan", LEVEL)
+    beams = messages.to_scan_beams(message, "scan", LEVEL, Parameters())
     assert beams.stamp_ns == 5_000_000_007
     assert beams.sensor == "scan"
     np.testing.assert_array_equal(beams.hit, [True, False, False, False, False, True])
@@ -87,7 +87,8 @@ def test_readings_become_beams_in_their_order():
 
 def test_limits_of_the_parameters():
     message = laser_scan(1, [0.3, 8.0, 3.0])
-    beams = messages.to_scan_beams(message, "scan", LEVEL, min_range=0.5, max_range=5.0)
+    limits = Parameters(min_laser_range=0.5, max_laser_range=5.0)
+    beams = messages.to_scan_beams(message, "scan", LEVEL, limits)
     np.testing.assert_array_equal(beams.hit, [False, False, True])
     length = np.linalg.norm(beams.points, axis=1)
     np.testing.assert_allclose(length, [NAN, 5.0, 3.0], rtol=1e-6)
@@ -98,7 +99,7 @@ def test_limits_of_the_parameters():
 )
 def test_times_of_beams(increment, times):
     message = laser_scan(1, [1.0, 1.0, 1.0], time_increment=increment)
-    found = messages.to_scan_beams(message, "scan", LEVEL).beam_time
+    found = messages.to_scan_beams(message, "scan", LEVEL, Parameters()).beam_time
     if times is None:
         assert found is None
     else:

@@ -13,7 +13,7 @@ from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
-from stillmap.live.ros.inputs import Mount, Parameters, to_cloud_beams, to_scan_beams
+from stillmap.live.ros.inputs import Mount, Parameters, to_scan_beams
 from stillmap.live.update import Update
 
 module = fake_ros.load("publishers")
@@ -46,28 +46,20 @@ def make_mover(number, position=(1.0, 2.0), velocity=(0.0, 1.0)):
 
 
 class TestMovers:
-    def test_each_has_a_body_an_arrow_and_its_number(self, node):
+    def test_each_has_a_body_and_an_arrow_in_place_of_earlier_ones(self, node):
         publishers(node)._publish_movers([make_mover(7)], 3_000_000_005)
         (message,) = node.sent["movers"]
-        body, arrow, text = message.markers
-        assert {m.id for m in message.markers} == {7}
-        assert len({m.ns for m in message.markers}) == 3
+        remove, body, arrow = message.markers
+        assert remove.action == 3
+        assert (body.id, arrow.id) == (7, 7)
+        assert body.ns != arrow.ns
         assert (body.header.frame_id, body.header.stamp.sec) == ("map", 3)
-        assert (body.type, arrow.type, text.type) == (3, 0, 9)
+        assert (body.type, arrow.type) == (3, 0)
         assert (body.pose.position.x, body.pose.position.y) == (1.0, 2.0)
         assert (body.scale.x, body.scale.y) == (0.6, 0.6)
         begin, end = arrow.points
         assert (end.x - begin.x, end.y - begin.y, end.z - begin.z) == (0.0, 1.0, 0.0)
-        assert text.text == "7"
-        assert text.pose.position.z > body.pose.position.z
-        assert all(m.lifetime.sec > 0 and m.pose.orientation.w == 1.0 for m in message.markers)
-
-    def test_markers_of_those_that_are_gone_are_removed_once(self, node):
-        publisher = publishers(node)
-        for movers in ([make_mover(1), make_mover(2)], [make_mover(2)], [], []):
-            publisher._publish_movers(movers, 1)
-        deleted = [[m.id for m in one.markers if m.action == 2] for one in node.sent["movers"]]
-        assert deleted == [[], [1, 1, 1], [2, 2, 2]]
+        assert all(m.lifetime.sec > 0 and m.pose.orientation.w == 1.0 for m in (body, arrow))
 
     def test_poses_are_headed_where_they_move_and_tell_that_there_is_nobody(self, node):
         publisher = publishers(node)
@@ -82,7 +74,7 @@ class TestMovers:
     def test_in_space_they_have_their_own_height(self, node):
         mover = make_mover(1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.5))
         publishers(node)._publish_movers([mover], 1)
-        body, arrow, _ = node.sent["movers"][0].markers
+        _, body, arrow = node.sent["movers"][0].markers
         assert body.pose.position.z == 3.0
         assert arrow.points[1].z == 3.5
 
@@ -160,7 +152,7 @@ class TestScans:
     def test_points_of_a_laser_are_in_its_own_frame(self, node):
         """Upside down too: the frame is, not the message."""
         message = laser_scan(5_000_000_001, [1.0, math.inf, 2.0, 3.0], angle_min=0.0)
-        beams = to_scan_beams(message, "scan", Mount(np.eye(3), is_upside_down=True))
+        beams = to_scan_beams(message, "scan", Mount(np.eye(3), is_upside_down=True), Parameters())
         arrival = SimpleNamespace(topic="scan", message=message, beams=beams)
         p_static = np.array([0.9, 0.5, 0.2, NAN], np.float32)
         publishers(node)._publish_scan(arrival, p_static)
@@ -174,12 +166,13 @@ class TestScans:
     def test_clouds_are_split_as_clouds(self, node):
         points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [NAN, 0.0, 0.0], [0.0, 90.0, 0.0]]
         message = point_cloud(5, points)
-        beams = to_cloud_beams(message, "points", Mount(np.eye(4)), max_range=50.0)
+        given = {"cloud_topic": "points", "max_laser_range": 50.0}
+        beams = to_scan_beams(message, "points", Mount(np.eye(4)), Parameters(**given))
         np.testing.assert_array_equal(beams.hit, [True, True, False, False])
         np.testing.assert_allclose(beams.points[3], [0.0, 50.0, 0.0])
         arrival = SimpleNamespace(topic="points", message=message, beams=beams)
         p_static = np.array([0.9, 0.1, NAN, 0.5], np.float32)
-        publishers(node, cloud_topic="points")._publish_scan(arrival, p_static)
+        publishers(node, **given)._publish_scan(arrival, p_static)
         static, dynamic, every = (
             read_cloud(node.sent[f"points_{name}"][0]) for name in ("static", "dynamic", "points")
         )
@@ -191,7 +184,7 @@ class TestScans:
 class TestPoses:
     def publish(self, node, T, covariance, T_map_odom, doubts=()):
         message = laser_scan(5_000_000_001, [1.0])
-        beams = to_scan_beams(message, "scan", Mount(np.eye(3)))
+        beams = to_scan_beams(message, "scan", Mount(np.eye(3)), Parameters())
         update = Update(T, covariance, np.ones(1, np.float32), T_map_odom, doubts)
         arrival = SimpleNamespace(topic="scan", message=message, beams=beams)
         publishers(node).publish_answer(arrival, update)

@@ -4,10 +4,13 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 from stillmap.cli.arguments import JSON, OTHERS, READ, read_options
 from stillmap.cli.console import format_rows, print_lines, show_share
+from stillmap.core.errors import InputError
+from stillmap.core.json import to_jsonable
 
 # entries of the summary that its text does not show, or shows in its heading
 _HIDDEN = ("input", "format", "dimension", "skipped_unit", "records", "read_options")
@@ -45,12 +48,14 @@ def run(args: argparse.Namespace) -> int:
         InputError: the recording cannot be read.
     """
     summaries = [_summarize(path, args) for path in args.input]
+    run = _summarize_overlap(summaries, args)
     if args.json:
-        content = summaries[0] if len(summaries) == 1 else {"recordings": summaries}
+        content = summaries[0] if len(summaries) == 1 else {"recordings": summaries, **run}
         print(json.dumps(content, indent=2, allow_nan=False))
         return 0
     for number, summary in enumerate(summaries):
         print_lines([*([""] * (number > 0)), *_format_summary(summary)])
+    print_lines(format_rows(run))
     return 0
 
 
@@ -61,6 +66,23 @@ def _summarize(path: str, args: argparse.Namespace) -> dict[str, Any]:
     with show_share(args.quiet, "reading") as progress:
         recording = read(path, read_options(args), progress=progress)
     return {"input": path, **summarize_recording(recording)}
+
+
+def _summarize_overlap(summaries: list[dict[str, Any]], args: argparse.Namespace) -> dict[str, Any]:
+    """What is left out of parts of one run that overlap, as `stillmap map` joins them."""
+    from stillmap.pipeline import inputs
+
+    times = [summary["time"] for summary in summaries if summary["time"]]
+    spans = sorted((time["first_stamp_ns"], time["last_stamp_ns"]) for time in times)
+    if not any(after[0] <= before[1] for before, after in pairwise(spans)):
+        return {}
+    try:
+        with show_share(args.quiet, "reading") as progress:
+            run = inputs.read(args.input, read_options(args), progress=progress)
+    except InputError:  # they are no parts of one run
+        return {}
+    skipped = to_jsonable(run.source.to_dict()).get("skipped") or {}
+    return {"as_one_run": {"scans": run.n_scans, "skipped": skipped}}
 
 
 def _format_summary(info: dict[str, Any]) -> Iterator[str]:

@@ -235,6 +235,7 @@ def _open_client(request: Request) -> Iterator[Any]:
     for name in ("distributed", "distributed.client", "tornado", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # outcomes say what they report
     if not request.scheduler:
+        import_extra("cryptography", "stillmap fleet", "run", group="fleet")  # for its TLS
         with (
             dask.LocalCluster(
                 n_workers=request.jobs,

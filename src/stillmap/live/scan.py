@@ -198,11 +198,16 @@ def _from_points(scan: Scan) -> tuple[Float32, Bool]:
     usable: Bool = finite & (near >= max(scan.min_range, MAX_ZERO_RANGE))
     usable &= near < MAX_PLAUSIBLE_RANGE
     points[~usable] = np.nan
-    if scan.hit is None:
-        return points, usable
-    hit = np.asarray(scan.hit, np.bool_)
-    require_length("hit", len(hit), len(points), "points")
-    return points, usable & hit
+    hit = usable
+    if scan.hit is not None:
+        given = np.asarray(scan.hit, np.bool_)
+        require_length("hit", len(given), len(points), "points")
+        hit = usable & given
+    if scan.max_range is None:
+        return points, hit
+    beyond = near > scan.max_range
+    points[beyond] *= (scan.max_range / near[beyond])[:, None]
+    return points, hit & ~beyond
 
 
 def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:

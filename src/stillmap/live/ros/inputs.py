@@ -135,75 +135,46 @@ def shape_of(message: Any) -> ScanShape:
     )
 
 
-def to_scan_beams(
-    message: Any, topic: str, mount: Mount, min_range: float = 0.0, max_range: float = 0.0
-) -> ScanBeams:
-    """The beams of a LaserScan, in its order.
+def to_scan_beams(message: Any, topic: str, mount: Mount, parameters: Parameters) -> ScanBeams:
+    """The beams of a LaserScan or PointCloud2 without fault, in its order.
 
     Args:
-        message: a LaserScan without fault.
+        message: a PointCloud2 may have times of the points.
         topic: where it came from: each is a sensor of its own.
-        mount: of the laser.
-        min_range: m, nearer readings are unusable.
-        max_range: m, farther readings count as free space up to here; 0: the laser's own maximum.
+        mount: of the sensor.
+        parameters: limits of the ranges.
     """
+    fields = _cloud_fields(message) if parameters.dimension == 3 else _laser_fields(message, mount)
+    fields["min_range"] = max(fields.get("min_range", 0.0), parameters.min_laser_range)
+    limits = fields.get("max_range"), parameters.max_laser_range
+    fields["max_range"] = min((limit for limit in limits if limit), default=None)
+    pose = mount.T_base_sensor
+    return to_beams(Scan(stamp_ns(message.header), sensor=topic, sensor_pose=pose, **fields))
+
+
+def _laser_fields(message: Any, mount: Mount) -> dict[str, Any]:
+    """Fields of a `Scan` from a LaserScan."""
     shape = shape_of(message)
-    angles = shape.angles()
-    times, duration = None, shape.time_increment * shape.n
-    if 0.0 < duration <= _MAX_SCAN_TIME:
-        times = shape.time_increment * np.arange(shape.n)
-    nearest = shape.range_min if 0.0 < shape.range_min < MAX_PLAUSIBLE_RANGE else 0.0
-    reach = [r for r in (shape.range_max, max_range) if 0.0 < r < MAX_PLAUSIBLE_RANGE]
-    return to_beams(
-        Scan(
-            stamp_ns(message.header),
-            np.asarray(message.ranges, np.float64),
-            -angles if mount.is_upside_down else angles,
-            sensor=topic,
-            sensor_pose=mount.T_base_sensor,
-            beam_times=times,
-            min_range=max(nearest, min_range),
-            max_range=min(reach, default=None),
-        )
-    )
+    angles, times = shape.angles(), shape.time_increment * np.arange(shape.n)
+    has_times = 0.0 < shape.time_increment * shape.n <= _MAX_SCAN_TIME
+    limits = {"min_range": shape.range_min, "max_range": shape.range_max}
+    return {
+        "ranges": np.asarray(message.ranges, np.float64),
+        "angles": -angles if mount.is_upside_down else angles,
+        "beam_times": times if has_times else None,
+        **{name: m for name, m in limits.items() if 0.0 < m < MAX_PLAUSIBLE_RANGE},
+    }
 
 
-def to_cloud_beams(
-    message: Any, topic: str, mount: Mount, min_range: float = 0.0, max_range: float = 0.0
-) -> ScanBeams:
-    """The beams of a PointCloud2 with a layout, in its order; see `to_scan_beams`.
-
-    Args:
-        message: with x, y, z, and perhaps times of the points.
-        topic: where it came from.
-        mount: of the lidar.
-        min_range: m, nearer points are unusable.
-        max_range: m, farther points count as free space up to here; 0: none do.
-    """
+def _cloud_fields(message: Any) -> dict[str, Any]:
+    """Fields of a `Scan` from a PointCloud2."""
     cloud = parse_cloud(message)
     if isinstance(cloud, str):
         raise TypeError(cloud)  # `find_layout` has said so
-    points, hit = cloud.points, np.ones(len(cloud.points), np.bool_)
-    if max_range > 0.0:
-        length = np.linalg.norm(points, axis=1)
-        hit = ~(length > max_range)  # what is no number stays what it is
-        points = points.copy()
-        with np.errstate(invalid="ignore"):  # infinite ones become NaN: unusable
-            points[~hit] *= (max_range / length[~hit])[:, None]
-    times = None
-    if cloud.times is not None:
-        times = np.where(np.isfinite(cloud.times), cloud.times, 0.0)  # of unusable points
-    return to_beams(
-        Scan(
-            stamp_ns(message.header),
-            points=points,
-            hit=hit,
-            sensor=topic,
-            sensor_pose=mount.T_base_sensor,
-            beam_times=times,
-            min_range=min_range,
-        )
-    )
+    times = cloud.times
+    if times is not None:
+        times = np.where(np.isfinite(times), times, 0.0)  # of unusable points
+    return {"points": cloud.points, "beam_times": times}
 
 
 def spread_covariance(covariance: Float) -> Float:

@@ -3,17 +3,16 @@
 message_filters has no such queue in Python: it pairs messages, and loses those without a partner.
 """
 
-import heapq
-import itertools
+from bisect import insort
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.live.ros.inputs import Mount, Parameters, shape_of, to_cloud_beams, to_scan_beams
+from stillmap.live.ros.inputs import Mount, Parameters, shape_of, to_scan_beams
 from stillmap.live.scan import ScanBeams
 
 if TYPE_CHECKING:
@@ -55,10 +54,8 @@ class Arrival(ShortRepr):
     arrived: float
 
 
-@dataclass(order=True)
-class _Waiting:
+class _Waiting(NamedTuple):
     stamp_ns: int
-    number: int
     topic: str
     message: Any
     arrived: float
@@ -90,7 +87,6 @@ class ScanIntake:
     def __init__(self, parameters: Parameters, transforms: "Transforms") -> None:
         self._parameters, self._transforms = parameters, transforms
         self.counts = Counter[str]()
-        self._numbers = itertools.count()
         self._mounts: dict[tuple[str, str], Mount] = {}
         self._begin()
 
@@ -124,9 +120,10 @@ class ScanIntake:
             return
         if self._first_arrived is None:
             self._first_arrived = now
-        heapq.heappush(self.waiting, _Waiting(stamp, next(self._numbers), topic, message, now))
+        waiting = _Waiting(stamp, topic, message, now)
+        insort(self.waiting, waiting, key=lambda scan: scan.stamp_ns)
         if len(self.waiting) > self._parameters.scan_queue_size:
-            heapq.heappop(self.waiting)
+            self.waiting.pop(0)
             self.counts[OVERFLOW] += 1
 
     def take(self, now: float) -> Arrival | None:
@@ -138,7 +135,7 @@ class ScanIntake:
             pose = self._transforms.odometry_at(first.stamp_ns)
             fault = NO_MOUNT if mount is None and has_waited else self._find_fault(first, pose)
             if fault is not None:
-                heapq.heappop(self.waiting)
+                self.waiting.pop(0)
                 self.counts[fault] += 1
                 continue
             if mount is None or self._must_wait(first, pose, now, has_waited):
@@ -211,14 +208,12 @@ class ScanIntake:
         return self._silent_ns != self._transforms.last_odometry_ns and not has_waited
 
     def _release(self, mount: Mount, pose: Float | None) -> Arrival:
-        scan = heapq.heappop(self.waiting)
+        scan = self.waiting.pop(0)
         if scan.stamp_ns > self._last_ns:
             self._last_ns, self._last_topics = scan.stamp_ns, set()
         self._last_topics.add(scan.topic)
         if pose is None and self._parameters.odom_frame:
             self.counts[NO_ODOMETRY] += 1
             self._silent_ns = self._transforms.last_odometry_ns
-        limits = self._parameters.min_laser_range, self._parameters.max_laser_range
-        convert = to_scan_beams if self._parameters.dimension == 2 else to_cloud_beams
-        beams = convert(scan.message, scan.topic, mount, *limits)
+        beams = to_scan_beams(scan.message, scan.topic, mount, self._parameters)
         return Arrival(scan.topic, scan.message, beams, pose, scan.arrived)

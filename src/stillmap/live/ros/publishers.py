@@ -44,9 +44,7 @@ except ImportError:
 
 _DEPTH, _SCAN_DEPTH = 10, 5  # messages kept for readers that fall behind
 _PERIOD_NS = 10**9  # between two updates of the map
-_NAMES = ("mover", "velocity", "number")  # namespaces of the markers of a mover
 _HEIGHT = 1.7  # m, of a cylinder: nobody knows better in the plane
-_LETTERS = 0.3  # m, height of numbers
 _ORANGE = {"r": 1.0, "g": 0.5, "b": 0.0, "a": 0.8}
 _WHITE = {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
 
@@ -75,7 +73,6 @@ class Publishers:
             ]
             for topic in parameters.topics
         }
-        self._shown = set[int]()  # numbers of the movers with markers
         self._tf_ns = 0  # of the last transform
 
     def publish_answer(self, arrival: Arrival, update: Update) -> None:
@@ -117,7 +114,7 @@ class Publishers:
         )
 
     def _publish_movers(self, movers: Sequence[Mover], stamp: int) -> None:
-        """The movers of a scan; markers of others are removed."""
+        """The movers of a scan; markers of earlier ones are removed."""
         header = _to_header(self._parameters.map_frame, stamp)
         if self._mover_poses.get_subscription_count():
             headings = [math.atan2(mover.velocity[1], mover.velocity[0]) for mover in movers]
@@ -129,17 +126,9 @@ class Publishers:
                 for mover, heading in zip(movers, headings, strict=True)
             ]
             self._mover_poses.publish(geometry.PoseArray(header=header, poses=poses))
-        if not self._markers.get_subscription_count():
-            return
-        numbers = {mover.number for mover in movers}
-        gone, self._shown = sorted(self._shown - numbers), numbers
-        markers = [
-            Marker(header=header, ns=name, id=number, action=Marker.DELETE)
-            for number in gone
-            for name in _NAMES
-        ]
-        markers += [marker for mover in movers for marker in _to_markers(mover, header)]
-        if markers:
+        if self._markers.get_subscription_count():
+            markers = [Marker(header=header, action=Marker.DELETEALL)]
+            markers += [marker for mover in movers for marker in _to_markers(mover, header)]
             self._markers.publish(MarkerArray(markers=markers))
 
     def _publish_scan(self, arrival: Arrival, p_static: Float32) -> None:
@@ -191,18 +180,19 @@ class MapPublisher:
         self._updates = None
         if OccupancyGridUpdate is None:
             node.get_logger().warning("map_msgs is missing: the map is published without updates")
-        else:
+        elif parameters.dimension == 2:
             self._updates = node.create_publisher(OccupancyGridUpdate, f"{topic}_updates", _DEPTH)
         # the map as it was published, with all updates; column and row of its lowest cell
         self._cells, self._first = np.zeros((0, 0), np.int8), np.zeros(2, np.int64)
-        self._waiting = dict[tuple[int, ...], MapChange]()
+        # rows and columns of the rectangle that changed since: the first, and after the last
+        self._low, self._high = np.zeros((2, 2), np.int64)
         self._published_ns = -_PERIOD_NS
 
     def publish(self, grid: GridMap, stamp: int) -> None:
         """The whole map; who comes later gets the last one."""
         self._cells = to_cells(grid.p_occupied, self._mode)
         self._first = np.rint(np.array(grid.origin[:2]) / grid.resolution).astype(np.int64)
-        self._waiting.clear()
+        self._low, self._high = np.array(self._cells.shape), np.zeros(2, np.int64)
         header, (height, width) = _to_header(self._frame, stamp), self._cells.shape
         info = MapMetaData(
             map_load_time=header.stamp,
@@ -217,49 +207,43 @@ class MapPublisher:
     def publish_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
         """Publish the tiles that changed, once a second; False: the map has become larger, and a
         whole one is due."""
-        if self._updates is None:
+        if self._updates is None or not self._updates.get_subscription_count():
             return True
         for change in changes:
-            if change.p_occupied.ndim == 2:
-                self._waiting[tuple(change.first_cell.tolist())] = change
-        if not self._waiting or 0 <= stamp - self._published_ns < _PERIOD_NS:
+            self._take_over(change)
+        if (self._low >= self._high).any() or 0 <= stamp - self._published_ns < _PERIOD_NS:
             return True
-        box = self._take_over(list(self._waiting.values()))
-        self._waiting.clear()
         self._published_ns = stamp
-        is_heard = self._updates.get_subscription_count() > 0
-        if box is not None and is_heard:
-            cells, (rows, columns) = self._cells[box], box
-            update = OccupancyGridUpdate(
-                header=_to_header(self._frame, stamp),
-                x=columns.start,
-                y=rows.start,
-                width=cells.shape[1],
-                height=cells.shape[0],
-                data=_to_data(cells, "b"),
-            )
-            self._updates.publish(update)
-        return box is not None or not is_heard
+        if not self._holds(self._low, self._high):
+            return False
+        (row, column), (end, right) = self._low.tolist(), self._high.tolist()
+        update = OccupancyGridUpdate(
+            header=_to_header(self._frame, stamp),
+            x=column,
+            y=row,
+            width=right - column,
+            height=end - row,
+            data=_to_data(self._cells[row:end, column:right], "b"),
+        )
+        self._updates.publish(update)
+        self._low, self._high = np.array(self._cells.shape), np.zeros(2, np.int64)
+        return True
 
-    def _take_over(self, changes: Sequence[MapChange]) -> tuple[slice, slice] | None:
-        """Rows and columns of the rectangle around changed tiles, which are taken over; None: they
-        are not all inside the map."""
-        low = (np.array([change.first_cell for change in changes]) - self._first)[:, ::-1]
-        high = low + [change.p_occupied.shape for change in changes]
-        if (low < 0).any() or (high > self._cells.shape).any():
-            return None
-        for begin, end, change in zip(low, high, changes, strict=True):
-            self._cells[_box(begin, end)] = to_cells(change.p_occupied, self._mode)
-        return _box(low.min(axis=0), high.max(axis=0))
+    def _take_over(self, change: MapChange) -> None:
+        """Enter a tile into the map, if it is inside."""
+        low = (change.first_cell - self._first)[::-1]
+        high = low + change.p_occupied.shape
+        self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+        if self._holds(low, high):
+            (row, column), (end, right) = low.tolist(), high.tolist()
+            self._cells[row:end, column:right] = to_cells(change.p_occupied, self._mode)
 
-
-def _box(low: Int64, high: Int64) -> tuple[slice, slice]:
-    (bottom, left), (top, right) = low.tolist(), high.tolist()
-    return slice(bottom, top), slice(left, right)
+    def _holds(self, low: Int64, high: Int64) -> bool:
+        return bool((low >= 0).all() and (high <= self._cells.shape).all())
 
 
 def _to_markers(mover: Mover, header: Any) -> list[Any]:
-    """A cylinder, an arrow to where it is a second later, and the number."""
+    """A cylinder, and an arrow to where it is a second later."""
     upright, width = geometry.Quaternion(w=1.0), 2.0 * mover.radius
 
     def make(kind: int, name: str, color: dict[str, float], scale: Sequence[float], at: Any) -> Any:
@@ -274,16 +258,13 @@ def _to_markers(mover: Mover, header: Any) -> list[Any]:
             lifetime=Duration(sec=1),  # markers vanish with a node that dies
         )
 
-    x, y, z = (*mover.position.tolist(), 0.5 * _HEIGHT)[:3]
-    vx, vy, vz = (*mover.velocity.tolist(), 0.0)[:3]
-    at, end = _to_vector((x, y, z)), _to_vector((x + vx, y + vy, z + vz))
-    top, origin = _to_vector((x, y, z + 0.5 * _HEIGHT + _LETTERS)), geometry.Point()
+    position = np.array((*mover.position, 0.5 * _HEIGHT)[:3])
+    at, end = _to_vector(position), _to_vector(position + (*mover.velocity, 0.0)[:3])
+    body = make(Marker.CYLINDER, "mover", _ORANGE, (width, width, _HEIGHT), at)
     diameters = (0.06, 0.14, 0.0)  # m, of shaft and head
-    body = make(Marker.CYLINDER, _NAMES[0], _ORANGE, (width, width, _HEIGHT), at)
-    arrow = make(Marker.ARROW, _NAMES[1], _WHITE, diameters, origin)
-    text = make(Marker.TEXT_VIEW_FACING, _NAMES[2], _WHITE, (0.0, 0.0, _LETTERS), top)
-    arrow.points, text.text = [at, end], str(mover.number)
-    return [body, arrow, text]
+    arrow = make(Marker.ARROW, "velocity", _WHITE, diameters, geometry.Point())
+    arrow.points = [at, end]
+    return [body, arrow]
 
 
 def _to_cloud(arrival: Arrival, p_static: Float32, chosen: Bool) -> Any:

@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,29 +16,10 @@ if TYPE_CHECKING:
     from stillmap.live.ros.node import LiveNode
 
 _SPIN = 0.1  # s after which a signal is seen at the latest
-_NEEDED = (
-    *("rclpy", "tf2_ros", "sensor_msgs", "nav_msgs", "geometry_msgs", "std_srvs"),
-    *("visualization_msgs", "diagnostic_msgs"),
-)
 _HINT = (
     "call `source /opt/ros/DISTRO/setup.bash` first, with the Python that this ROS was built for, "
     "or install stillmap into an environment that has rclpy"
 )
-
-
-def require_ros() -> None:
-    """Refuse to go on without ROS.
-
-    Raises:
-        InputError: a package that is needed cannot be imported.
-    """
-    for name in _NEEDED:
-        try:
-            import_module(name)
-        except ImportError as error:  # it may be made for another Python
-            is_missing = isinstance(error, ModuleNotFoundError) and error.name == name
-            what = "is not in this environment" if is_missing else f"cannot be imported: {error}"
-            raise InputError(f"{name} {what}", hint=_HINT) from error
 
 
 def run(
@@ -67,12 +47,13 @@ def run(
         InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
         KeyboardInterrupt: Ctrl-C again while the result is written.
     """
-    require_ros()
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
 
-    from stillmap.live.ros.node import LiveNode
-
+        from stillmap.live.ros.node import LiveNode
+    except ImportError as error:  # a package that is missing, or made for another Python
+        raise InputError(f"ROS 2 cannot be imported: {error}", hint=_HINT) from error
     try:
         rclpy.init(args=list(ros_arguments), signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:

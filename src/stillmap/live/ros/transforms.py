@@ -1,5 +1,6 @@
 """Mounts and odometry from TF, by the user's own tf2_ros, and odometry from Odometry messages."""
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from stillmap.io.ros.tf import project_to_plane
 from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.live.ros.inputs import Mount, Parameters
 
-_MESSAGES, _ROBOT = "odometry", "robot"  # frames of Odometry messages in a buffer of their own
+_MESSAGES, _ROBOT = "stillmap_odometry", "stillmap_robot"  # frames of Odometry messages
 
 
 class Transforms:
@@ -36,8 +37,7 @@ class Transforms:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        duration = Duration(seconds=parameters.tf_buffer_duration)
-        self.buffer, self._messages = Buffer(duration), Buffer(duration)
+        self.buffer = Buffer(Duration(seconds=parameters.tf_buffer_duration))
         self._child = ""
         self.source: str | None = None
 
@@ -49,7 +49,6 @@ class Transforms:
     def forget(self) -> None:
         """Forget all but the static transforms: time has begun anew."""
         self.buffer.clear()
-        self._messages.clear()
 
     def add_odometry(self, message: Any) -> None:
         """Add an Odometry message."""
@@ -61,7 +60,7 @@ class Transforms:
             child_frame_id=_ROBOT,
             transform=Transform(translation=at, rotation=pose.orientation),
         )
-        self._messages.set_transform(transform, "stillmap")
+        self.buffer.set_transform(transform, "stillmap")
 
     def odometry_at(self, stamp: int) -> Float | None:
         """(D+1, D+1) T_odom_base; None: it is not known (yet)."""
@@ -70,9 +69,9 @@ class Transforms:
             return None
         T = None
         if self.source in (None, "TF"):
-            T, source = _look_up(self.buffer, names.odom_frame, names.base_frame, stamp), "TF"
+            T, source = self._look_up(names.odom_frame, names.base_frame, stamp), "TF"
         if T is None and self.source in (None, names.odom_topic):
-            T, source = _look_up(self._messages, _MESSAGES, _ROBOT, stamp), names.odom_topic
+            T, source = self._look_up(_MESSAGES, _ROBOT, stamp), names.odom_topic
             T = None if T is None else T @ self._child_to_base(stamp)
         if T is None:
             return None
@@ -83,8 +82,11 @@ class Transforms:
     def last_odometry_ns(self) -> int:
         """Stamp of the last odometry; 0: there is none."""
         names = self._parameters
-        of_tf = _last_ns(self.buffer, names.odom_frame, names.base_frame)
-        return max(of_tf, _last_ns(self._messages, _MESSAGES, _ROBOT))
+        stamps = [0]
+        for frames in ((names.odom_frame, names.base_frame), (_MESSAGES, _ROBOT)):
+            with suppress(TransformException):
+                stamps.append(self.buffer.get_latest_common_time(*frames).nanoseconds)
+        return max(stamps)
 
     def find_mount(self, topic: str, frame: str, stamp: int) -> Mount | None:
         """Pose of a sensor on the robot: by a parameter, else by TF; None: it is not known."""
@@ -93,7 +95,7 @@ class Transforms:
             return self._given_mount(names.topics.index(topic))
         T: Float | None = np.eye(4)
         if frame != names.base_frame:
-            T = _look_up(self.buffer, names.base_frame, frame, stamp)
+            T = self._look_up(names.base_frame, frame, stamp)
         if T is None or names.dimension == 3:
             return None if T is None else Mount(T)
         flat, is_upside_down, _ = project_to_plane(T[None])
@@ -112,24 +114,16 @@ class Transforms:
         """(4, 4) T_child_base, the base frame in the child frame of the messages; the identity if
         no transform says otherwise."""
         base = self._parameters.base_frame
-        T = _look_up(self.buffer, self._child, base, stamp) if self._child else None
+        T = self._look_up(self._child, base, stamp) if self._child else None
         return np.eye(4) if T is None else T
 
-
-def _look_up(buffer: Any, target: str, source: str, stamp: int) -> Float | None:
-    """(4, 4) T_target_source; None: it is not known at this time."""
-    try:
-        transform = buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp)).transform
-    except TransformException:
-        return None
-    T, t, q = np.eye(4), transform.translation, transform.rotation
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = t.x, t.y, t.z
-    return T if (np.abs(T) < MAX_TRANSLATION).all() else None
-
-
-def _last_ns(buffer: Any, target: str, source: str) -> int:
-    try:
-        return int(buffer.get_latest_common_time(target, source).nanoseconds)
-    except TransformException:
-        return 0
+    def _look_up(self, target: str, source: str, stamp: int) -> Float | None:
+        """(4, 4) T_target_source; None: it is not known at this time."""
+        try:
+            found = self.buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp))
+        except TransformException:
+            return None
+        T, t, q = np.eye(4), found.transform.translation, found.transform.rotation
+        T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        T[:3, 3] = t.x, t.y, t.z
+        return T if (np.abs(T) < MAX_TRANSLATION).all() else None
