@@ -78,16 +78,17 @@ def test_progress_is_told(short):
     assert list(dict.fromkeys(first)) == [*steps, "labelling beams"]
     assert all(done <= total for _, _, done, total in told)
     after = [at for at in told if at[1] == 0]
-    steps = ["labelling beams", "making the map", "counting observations"]
+    steps = ["calibrating", "labelling beams", "making the map", "counting observations"]
     steps += ["tracking objects", "rating the map"]
-    assert after == [(step, 0, 0, 0) for step in steps] == told[-5:]
+    assert after == [(step, 0, 0, 0) for step in steps]
+    assert after[1:] == told[-5:]
 
 
 @pytest.mark.parametrize(
     ("leap", "said"),
     [
-        ((0.0, 0.0, np.radians(170)), "found by a wider search, first at scan 30 (x "),
-        ((30.0, 0.0, 0.0), "odometry and scans disagree at 1 scan ("),
+        ((0.0, 0.0, np.radians(170)), "found by a wider search, outside"),
+        ((30.0, 0.0, 0.0), "odometry and scans disagree ("),
     ],
 )
 def test_a_leap_of_the_odometry_is_reported(room, leap, said):

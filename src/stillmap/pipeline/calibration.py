@@ -92,8 +92,10 @@ def calibrate_recording(
         applied = _place_lasers(applied, found)
     for k, laser in enumerate(found.lasers):
         which = "the laser" if len(found.lasers) == 1 else f"laser {k + 1}"
-        sentences += _laser_sentences(which, laser, found.upside_down[k])
-    return applied, found, [*sentences, *_odometry_sentences(found.odometry)]
+        if found.upside_down[k]:
+            sentences.append(f"{which} hangs upside down, as its motion shows: it is mirrored")
+        sentences += _describe(which, laser)
+    return applied, found, [*sentences, *_describe("odometry", found.odometry)]
 
 
 def time_sweeps(recording: Recording, options: Options) -> tuple[Recording, Options, list[str]]:
@@ -191,41 +193,24 @@ def _correct_odometry(recording: Recording, found: Calibration) -> Recording:
     return dataclasses.replace(recording, T_odom_base=odometry)
 
 
-def _laser_sentences(which: str, laser: dict[str, Parameter], upside_down: bool) -> Iterator[str]:
-    if upside_down:
-        yield f"{which} hangs upside down, as its motion shows: its scans are mirrored"
-    yaw = laser.get(YAW)
-    if yaw is not None and yaw.significant:
-        value, std, nominal = (math.degrees(v) for v in (yaw.value, yaw.std, yaw.nominal))
-        yield (
-            f"{which} is turned by {value:.1f} +- {std:.1f} degrees on the robot, as its motion "
-            f"shows, not by {nominal:.1f} as recorded: used"
-        )
-    place = {name: laser[name] for name in POSITION if name in laser}
-    if any(one.significant for one in place.values()):
-        sides = dict(zip(POSITION, ("ahead", "left"), strict=True))
-        here = " and ".join(f"{one.value:.2f} m {sides[name]}" for name, one in place.items())
-        there = " and ".join(f"{one.nominal:.2f} m {sides[name]}" for name, one in place.items())
-        std = max(one.std for one in place.values())
-        yield (
-            f"{which} is {here} of the robot's centre (+- {std:.3f} m), as its motion shows, not "
-            f"{there} as recorded: used"
-        )
+# what a parameter is, its unit, and how many of it are one of ours
+_QUANTITIES = {
+    YAW: ("yaw on the robot", " degrees", math.degrees(1.0)),
+    "x": ("place ahead of the robot's centre", " m", 1.0),
+    "y": ("place left of the robot's centre", " m", 1.0),
+    SCALE: ("distance, over that of the scans,", "", 1.0),
+    GAIN: ("rotation, over that of the scans,", "", 1.0),
+    LATENCY: ("delay against the scans", " s", 1.0),
+}
 
 
-def _odometry_sentences(odometry: dict[str, Parameter]) -> Iterator[str]:
-    significant = {name: one for name, one in odometry.items() if one.significant}
-    for name, what in ((SCALE, "distance"), (GAIN, "rotation")):
-        if one := significant.get(name):
-            percent, std = 100.0 * (one.value - 1.0), 100.0 * one.std
-            more = "more" if percent > 0 else "less"
+def _describe(of: str, parameters: dict[str, Parameter]) -> Iterator[str]:
+    """A sentence for each parameter that is not as recorded."""
+    for name, one in parameters.items():
+        if one.significant:
+            what, unit, factor = _QUANTITIES[name]
+            value, std, nominal = (factor * v for v in (one.value, one.std, one.nominal))
             yield (
-                f"odometry counts {abs(percent):.1f} +- {std:.1f} % {more} {what} than the scans "
-                "show: corrected"
+                f"{of}: {what} is {value:.4g} +- {std:.2g}{unit}, as the motion shows, not "
+                f"{nominal:.4g} as recorded: used"
             )
-    if latency := significant.get(LATENCY):
-        when = "late" if latency.value > 0 else "early"
-        yield (
-            f"odometry is {abs(latency.value):.2f} +- {latency.std:.2f} s {when} against the "
-            "scans: corrected"
-        )

@@ -21,47 +21,32 @@ def find_warnings(
     """One sentence per warning, those of the reader first; see `core.errors`.
 
     Args:
-        best: the estimate that was kept.
-        recording: the input.
+        best: the estimate that is kept.
+        recording: as mapped.
         records: of all iterations.
     """
     return [
         *recording.source.warnings,
         *_input_warnings(best, recording),
         *_source_warnings(records, best.number),
-        *_odometry_warnings(best),
         *_length_warnings(best),
-        *_place_warnings(best),
-        *_fit_warnings(best, recording),
+        *_scan_warnings(best, recording),
     ]
 
 
 def find_map_warnings(maps: Maps, recording: Recording, poses: Float) -> list[str]:
-    """That the map leaves out what is far from most of the place: one sentence, or none.
-
-    Args:
-        maps: of the recording.
-        recording: T scans.
-        poses: (T, D+1, D+1) T_map_base.
-    """
+    """That the map leaves out what is far from most of the place: one sentence, or none."""
     if not len(maps.beyond):
         return []
     x0, y0, x1, y1 = extent(maps.filtered)
     x, y = recording.T_map_sensor(poses)[:, :2, -1].T
     outside = np.flatnonzero((x < x0) | (x > x1) | (y < y0) | (y > y1))
-    what = "surfaces that a few beams show lie"
-    if len(outside):
-        scan = outside[0]
-        named = f"scan {scan} at x {x[scan]:.7g} m, y {y[scan]:.7g} m"
-        what = f"{_count_scans(len(outside))} lie{'s' * (len(outside) == 1)}"
-        what += f" (first {named})" if len(outside) > 1 else f" ({named})"
-    middle = np.array([x0 + x1, y0 + y1]) / 2.0
-    distance = float(np.linalg.norm(maps.beyond - middle, axis=1).max())
+    what = f"{_count_scans(len(outside))} (first scan {outside[0]})" if len(outside) else "surfaces"
+    distance = np.linalg.norm(maps.beyond - np.array([x0 + x1, y0 + y1]) / 2.0, axis=1).max()
     return [
         advise(
-            f"{what} outside the map, up to {distance:.4g} m from its middle: a map of everything "
-            f"would be nearly empty, so it shows {x0:.1f} to {x1:.1f} m in x and {y0:.1f} to "
-            f"{y1:.1f} m in y, where most was seen; poses and labels are of all scans",
+            f"{what} outside the map, up to {distance:.4g} m from its middle: it shows "
+            f"{x0:.1f} to {x1:.1f} m in x and {y0:.1f} to {y1:.1f} m in y, where most was seen",
             "check the poses of these scans" if len(outside) else "limit read.max_range",
         )
     ]
@@ -96,23 +81,6 @@ def _source_warnings(records: Sequence[IterationRecord], best: int) -> Iterator[
             )
 
 
-def _odometry_warnings(best: Estimate) -> Iterator[str]:
-    """Scans that contradict odometry: their poses follow the scans, so nothing has to be done."""
-    found = best.m_step.diagnostics
-    if faults := found.odometry_faults:
-        yield (
-            f"odometry and scans disagree at {_count_scans(len(faults))} (wheel slip or stall, "
-            f"odometry that starts again), first at {_place(best, faults[0])}: poses follow the "
-            "scans there"
-        )
-    if widened := found.widened:
-        yield (
-            f"{_count_scans(len(widened))} lay outside the uncertainty of odometry and "
-            f"{'were' if len(widened) > 1 else 'was'} found by a wider search, first at "
-            f"{_place(best, widened[0])}"
-        )
-
-
 def _length_warnings(best: Estimate) -> Iterator[str]:
     """That scans do not show how far the robot went."""
     bare = best.m_step.diagnostics.bare_stretches
@@ -128,31 +96,49 @@ def _length_warnings(best: Estimate) -> Iterator[str]:
         )
 
 
-def _place_warnings(best: Estimate) -> Iterator[str]:
-    """That the robot was carried elsewhere, or may be at another place."""
+def _scan_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
+    """What is odd at some scans, how often, and where first."""
     found = best.m_step.diagnostics
-    for scan in found.ambiguous:
-        yield advise(
-            f"from {_place(best, scan)} on, another place fits about as well as the one that "
-            "odometry leads to: odometry's was kept",
+    for scans, what, todo in (
+        (
+            found.odometry_faults,
+            "odometry and scans disagree (wheel slip or stall, odometry that starts again): poses "
+            "follow the scans there",
+            "",
+        ),
+        (found.widened, "found by a wider search, outside the uncertainty of odometry", ""),
+        (
+            found.ambiguous,
+            "from there on, another place fits about as well as that of odometry, which was kept",
             "look whether walls are doubled there; if so, record again with more of the way "
             "between the two places",
-        )
-    for scan in found.breaks:
-        what = f"before {_place(best, scan)} the robot was carried elsewhere"
-        if scan not in found.unconnected:
-            yield f"{what}: it was relocalized among the places known from before"
-            continue
-        yield advise(
-            f"{what}: no place after it is known from before, so that this part of the map lies at "
-            "an arbitrary pose",
+        ),
+        (
+            [scan for scan in found.breaks if scan not in found.unconnected],
+            "the robot was carried elsewhere before, and relocalized among the known places",
+            "",
+        ),
+        (
+            found.unconnected,
+            "the robot was carried elsewhere before, to where no place is known: the part of the "
+            "map from there on lies at an arbitrary pose",
             "record again so that the robot ends where it was before, or map the part before and "
             "the part after on their own",
-        )
+        ),
+        (
+            _lost_scans(best, recording),
+            "the scan fits the map badly (less than a fifth of the beams)",
+            "look for bent or doubled walls there; if there are any, record that part again, "
+            "slower or with odometry",
+        ),
+    ):
+        if scans:
+            text = f"{_count_scans(len(scans))}, first {_place(best, scans[0])}: {what}"
+            yield advise(text, todo) if todo else text
 
 
-def _fit_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
-    """That scans fit the map badly; not the first of a laser: others may have looked elsewhere."""
+def _lost_scans(best: Estimate, recording: Recording) -> list[int]:
+    """Scans that fit the map badly, but for the first of a laser: others may look elsewhere."""
     is_lost = best.m_step.explained < _LOST
     starts = [0, *best.m_step.diagnostics.breaks, recording.n_scans]
     for first, end in itertools.pairwise(starts):
@@ -160,14 +146,7 @@ def _fit_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
             recording.sensor[first:end], return_index=True, return_counts=True
         )
         is_lost[first + of_sensor[n > 1]] = False  # of a sensor that moves, each scan is the first
-    lost = np.flatnonzero(is_lost)
-    if len(lost):
-        yield advise(
-            f"{_count_scans(len(lost))} fit{'s' * (len(lost) == 1)} the map badly (less than a "
-            f"fifth of the beams), first at {_place(best, lost[0])}",
-            "look for bent or doubled walls there; if there are any, record that part again, "
-            "slower or with odometry",
-        )
+    return np.flatnonzero(is_lost).tolist()
 
 
 def _place(best: Estimate, scan: int) -> str:
