@@ -35,7 +35,7 @@ from common import (
 from model_scores import score_model
 from tables import Column, means_and_worst
 
-from stillmap.sim import scene_by_name, simulate, simulate_rig, write_rig, write_simulation
+from stillmap.sim import scene_by_name, simulate, write_simulation
 from stillmap.sim.camera import SKY
 from stillmap.sim.truth import load_image_truth
 
@@ -132,7 +132,7 @@ def _rows(job: Job, folder: Path) -> Scores:
     tilts = scene.rig.tilts
     if not sim.exists():
         if tilts:
-            write_rig(simulate_rig(scene, job.seed), sim)
+            write_simulation(simulate(scene, job.seed), sim)
         else:
             write_simulation(simulate(scene, job.seed), sim)
     inputs = [sim / "horizontal", "--tilting", sim / "tilting"] if tilts else [sim]

@@ -30,8 +30,8 @@ import stillmap
 from stillmap.core import config
 from stillmap.pipeline.tilting import PlanarResult, TiltingResult, build_tilting
 from stillmap.results.eval.labels import score_labels
-from stillmap.sim import scene_by_name, simulate_rig
-from stillmap.sim.simulator import RigSimulation
+from stillmap.sim import scene_by_name, simulate
+from stillmap.sim.simulator import Simulation
 
 WORLDS: dict[str, dict[str, Any]] = {
     "hall": {"crowd": {"people": 30}},
@@ -89,12 +89,12 @@ def rows(job: Job) -> dict[str, Scores]:
     return {way: scores(rig, p_static) for way, p_static in labels.items()}
 
 
-def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, TiltingResult]]:
+def run(job: Job) -> tuple[Simulation, NDArray[np.float32], dict[str, TiltingResult]]:
     """A rig, P(static) of tilting beams by their own evidence alone, and with the flat laser."""
     scene = scene_by_name(job.world, config.merge_nested(WORLDS[job.world], _COMMON))
-    rig = simulate_rig(scene, job.seed)
+    rig = simulate(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
-    result = stillmap.build(rig.horizontal.recording, chosen)
+    result = stillmap.build(rig.recording, chosen)
     flat = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
     tilting = rig.tilting.recording
     built = {
@@ -106,7 +106,7 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     return rig, alone.p_static, built
 
 
-def scores(rig: RigSimulation, p_static: NDArray[np.float32]) -> Scores:
+def scores(rig: Simulation, p_static: NDArray[np.float32]) -> Scores:
     """Of the beams that hit something and whose place is known."""
     truth, hit = rig.tilting.truth, rig.tilting.recording.hit & ~np.isnan(p_static)
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]

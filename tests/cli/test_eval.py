@@ -12,7 +12,7 @@ from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import write_tum
 from stillmap.results.map_server import write_map_npz
 from stillmap.results.reader import Grid
-from stillmap.sim import Scene, scene_by_name, simulate, simulate_rig, write_rig, write_simulation
+from stillmap.sim import Scene, scene_by_name, simulate, write_simulation
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
@@ -172,7 +172,7 @@ def test_map(capsys, simulated, result):
     first = se2.parameters(np.load(simulated / "truth/T_world_base.npy")[0])
     assert s["T_world_map"] == pytest.approx(first.tolist(), abs=1e-6)
     assert main(["eval", "map", str(result), str(simulated)]) == 0
-    assert "walls kept              1" in capsys.readouterr().out
+    assert "walls_kept              1" in capsys.readouterr().out
 
 
 def test_map_with_people_against_reference_map(capsys, simulated, result, tmp_path):
@@ -275,7 +275,7 @@ def rig(tmp_path_factory) -> Path:
     """What two lasers recorded, as many beams each at the same times."""
     changes = {"rig": {"tilts": True}, "robot": {"scans": 20, "scan_rate": 37.5}}
     path = tmp_path_factory.mktemp("rig") / "sim"
-    write_rig(simulate_rig(scene_by_name("hall", changes), 2), path)
+    write_simulation(simulate(scene_by_name("hall", changes), 2), path)
     for name in ("stamp_ns", "offset"):
         of = [np.load(path / part / f"{name}.npy") for part in ("horizontal", "tilting")]
         np.testing.assert_array_equal(*of)

@@ -50,7 +50,6 @@ def test_sessions_are_recordings_with_truth_in_common(tmp_path: Path, capsys) ->
     ("flags", "error"),
     [
         (("--sessions", "0"), "must be 1 or more"),
-        (("--sessions", "2", "--format", "carmen"), "sessions are written as recording folders"),
         (("--sessions", "2", "--lidar", "tilting"), "one laser or lidar"),
     ],
 )
@@ -110,31 +109,14 @@ def test_tilting_laser_makes_two_recordings(
         ("--lidar 0", "channels"),
         ("--lidar many", "channels"),
         ("--lidar tilting --second-laser", "rig"),
-        ("--lidar tilting --format carmen", "3D"),
         ("--lidar 16 --beams 90", "laser.beams"),
         ("--lidar 16 --second-laser", "laser.second_laser"),
-        ("--lidar 16 --format carmen", "3D"),
     ],
 )
 def test_laser_options_are_refused_for_lidar(tmp_path: Path, flags: str, what: str) -> None:
     with pytest.raises(InputError, match=what):
         call("hall", "-o", str(tmp_path / "sim"), *flags.split())
     assert not (tmp_path / "sim").exists()
-
-
-def test_carmen_log_equals_recording_folder(tmp_path: Path) -> None:
-    call("hall", "-o", str(tmp_path / "a"), *QUICK)
-    call("hall", "-o", str(tmp_path / "b"), *QUICK, "--format", "carmen")
-    own, log = io.read(tmp_path / "a"), io.read(tmp_path / "b/recording.log")
-    np.testing.assert_array_equal(own.stamp_ns, log.stamp_ns)
-    np.testing.assert_array_equal(own.hit, log.hit)
-    np.testing.assert_allclose(own.points[own.hit], log.points[log.hit], atol=0.0051)
-    assert own.T_odom_base is not None
-    assert log.T_odom_base is not None
-    np.testing.assert_allclose(own.T_odom_base, log.T_odom_base, atol=2e-6)
-    np.testing.assert_allclose(own.T_base_sensor, log.T_base_sensor, atol=2e-5)
-    a, b = load_truth(tmp_path / "a"), load_truth(tmp_path / "b")
-    np.testing.assert_array_equal(a.mover, b.mover)
 
 
 def test_unknown_scene(tmp_path: Path) -> None:

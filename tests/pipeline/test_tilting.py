@@ -12,7 +12,7 @@ from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow, select_time
-from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
+from stillmap.sim import load_truth, scene_by_name, simulate, write_simulation
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 QUICK += ("--set", "mesh.enabled=false")
@@ -28,7 +28,7 @@ def rig(tmp_path_factory):
         "robot": {"scans": 300, "scan_rate": 25.0},
         "crowd": {"people": 25},
     }
-    write_rig(simulate_rig(scene_by_name("hall", changes), 5), path)
+    write_simulation(simulate(scene_by_name("hall", changes), 5), path)
     return path
 
 

@@ -8,14 +8,14 @@ from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.prepare.beam_times import assemble_tilting_laser
-from stillmap.sim import scene_by_name, simulate_rig
+from stillmap.sim import scene_by_name, simulate
 
 
 @functools.cache
 def rig():
     laser = {"sweep_time": 0.02, "beams": 61}
     robot = {"scans": 60, "scan_rate": 20.0}
-    return simulate_rig(
+    return simulate(
         scene_by_name("hall", {"laser": laser, "robot": robot, "rig": {"tilts": True}}), 3
     )
 

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap import io as recordings
 from stillmap.core.errors import InputError
-from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
+from stillmap.sim import load_truth, scene_by_name, simulate, write_simulation
 from stillmap.sim.options import RigOptions
 
 
@@ -16,11 +16,11 @@ def run(sweep_time=0.0):
     laser = {"range_noise": 0.0, "no_return_share": 0.0, "sweep_time": sweep_time}
     robot = {"scans": 100, "scan_rate": 10.0}
     changes = {"laser": laser, "robot": robot, "rig": {"tilts": True}}
-    return simulate_rig(scene_by_name("hall", changes), 3)
+    return simulate(scene_by_name("hall", changes), 3)
 
 
 def test_both_have_the_same_clock_robot_and_movers():
-    flat, tilting = run().horizontal, run().tilting
+    flat, tilting = run(), run().tilting
     assert (flat.recording.dimension, tilting.recording.dimension) == (2, 3)
     np.testing.assert_array_equal(flat.recording.stamp_ns, tilting.recording.stamp_ns)
     np.testing.assert_array_equal(flat.truth.movers, tilting.truth.movers)
@@ -61,12 +61,12 @@ def test_floor_ceiling_and_walls_are_seen_in_3d(end_points):
 
 
 def test_a_folder_of_both(tmp_path):
-    write_rig(run(), tmp_path / "rig")
-    for name, one in (("horizontal", run().horizontal), ("tilting", run().tilting)):
+    write_simulation(run(), tmp_path / "rig")
+    for name, one in (("horizontal", run()), ("tilting", run().tilting)):
         read, truth = recordings.read(tmp_path / "rig" / name), load_truth(tmp_path / "rig" / name)
         np.testing.assert_array_equal(read.points, one.recording.points)
         np.testing.assert_array_equal(truth.mover, one.truth.mover)
     np.testing.assert_array_equal(np.load(tmp_path / "rig/joint_angle.npy"), run().joint_angle)
     with pytest.raises(InputError, match="already"):
-        write_rig(run(), tmp_path / "rig")
-    write_rig(run(), tmp_path / "rig", overwrite=True)
+        write_simulation(run(), tmp_path / "rig")
+    write_simulation(run(), tmp_path / "rig", overwrite=True)

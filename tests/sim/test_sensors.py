@@ -5,7 +5,7 @@ import pytest
 
 from stillmap import io
 from stillmap.core import se2
-from stillmap.sim import scene_by_name, simulate, write_simulation
+from stillmap.sim import scene_by_name, simulate
 
 
 def taken(beams=61, scans=60, name="hall", **laser):
@@ -62,8 +62,8 @@ def test_hits_of_both_lasers_lie_on_the_walls(wall_distance, end_points):
 
 def test_two_lasers_survive_as_a_carmen_log(tmp_path):
     run = taken(60, second_laser=True)
-    write_simulation(run, tmp_path / "sim", format="carmen")
-    log, own = io.read(tmp_path / "sim/recording.log"), run.recording
+    io.write(run.recording, tmp_path / "sim.log")
+    log, own = io.read(tmp_path / "sim.log"), run.recording
     np.testing.assert_array_equal(log.sensor, own.sensor)
     np.testing.assert_array_equal(log.stamp_ns, own.stamp_ns)
     np.testing.assert_allclose(log.points[log.hit], own.points[own.hit], atol=0.0051)

@@ -15,9 +15,8 @@ from stillmap.core.errors import InputError, printable
 from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, Show, is_terminal
 
-_UNITS = ("m", "s", "ns", "deg", "hz")  # at the end of keys
 _EMPTY: tuple[Any, ...] = (None, "", [], {}, ())
-_MAX_INLINE, _MAX_ITEMS = 96, 10  # characters of an object, items of a list, on one line
+_WIDTH = 96  # characters of an object on one line
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
@@ -88,62 +87,31 @@ def print_lines(lines: Iterable[str]) -> None:
     print("\n".join(map(printable, lines)))
 
 
-def print_rows(content: Mapping[str, Any]) -> None:
-    """Print JSON values to stdout as text; see `format_rows`."""
-    print_lines(format_rows(content))
-
-
 def format_rows(content: Mapping[str, Any], indent: str = "") -> Iterator[str]:
-    """Yield a line for each entry of a JSON object, without empty ones; of sentences, one for each.
+    """Yield a line for each entry of a JSON object that is not empty, under the name it has there.
 
-    Keys may end with a unit, as in `duration_s`; stamps in nanoseconds are shown in seconds. Short
-    objects are shown on one line, others entry by entry, indented.
+    Of lists of objects and of sentences each item has a line.
     """
     for key, value in content.items():
-        title, unit = _split_unit(key)
-        is_list = isinstance(value, list | tuple)
-        is_table = is_list and any(isinstance(item, dict | str) for item in value)
+        is_table = isinstance(value, list) and any(isinstance(item, dict | str) for item in value)
         for item in value if is_table else [value]:
             if item in _EMPTY:
                 continue
-            text, inner = _format_value(item, unit), item if isinstance(item, dict) else {}
-            shown = f"{indent}{title} ({unit})" if inner and unit else f"{indent}{title}"
-            is_nested = any(isinstance(value, dict) for value in inner.values())
-            if is_nested or (inner and len(text) > _MAX_INLINE):
-                yield shown
-                yield from format_rows(inner, f"{indent}  ")
+            text = _format_value(item)
+            if isinstance(item, dict) and (dict in map(type, item.values()) or len(text) > _WIDTH):
+                yield f"{indent}{key}"
+                yield from format_rows(item, f"{indent}  ")
             else:
-                yield f"{shown:<22}  {text}"
+                yield f"{indent + key:<22}  {text}"
 
 
-def _format_value(value: Any, unit: str = "") -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, dict):
-        entries = [(*_split_unit(key), item) for key, item in value.items()]
-        words = [
-            f"{title} {_format_value(item, of)}"
-            for title, of, item in entries
-            if item not in _EMPTY
-        ]
-        return ", ".join(words)
+        shown = [(key, item) for key, item in value.items() if item not in _EMPTY]
+        return ", ".join(f"{key} {_format_value(item)}" for key, item in shown)
     if isinstance(value, list | tuple):
-        shown = [_format_value(item) for item in value[:_MAX_ITEMS]]
-        text = ", ".join([*shown, "..."] if len(value) > _MAX_ITEMS else shown)
-    elif unit == "ns" and isinstance(value, int):
-        from stillmap.core.timestamps import format_seconds  # NumPy takes long to load
-
-        text, unit = format_seconds(value), "s"
-    elif isinstance(value, bool):
-        text = "yes" if value else "no"
-    else:
-        text = f"{value:.6g}" if isinstance(value, float) else str(value)
-    return f"{text} {unit}" if unit else text
-
-
-def _split_unit(key: str) -> tuple[str, str]:
-    """Words of a key, and the unit at its end."""
-    words = str(key).split("_")
-    unit = words.pop() if len(words) > 1 and words[-1] in _UNITS else ""
-    return " ".join(words), unit.replace("hz", "Hz")
+        return ", ".join(map(_format_value, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def print_json(content: dict[str, Any] | list[dict[str, Any]]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from stillmap.cli.arguments import add_flags
-from stillmap.cli.console import print_json, print_rows
+from stillmap.cli.console import format_rows, print_json, print_lines
 from stillmap.core.errors import InputError
 
 DESCRIPTION = (
@@ -199,5 +199,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(values)
     else:
-        print_rows({**values, "units": score.units})
+        print_lines(format_rows({**values, "units": score.units}))
     return 0

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -89,12 +88,4 @@ def _format_summary(info: dict[str, Any]) -> Iterator[str]:
     yield f"{info['input']}: {info['format'] or 'stillmap recording'}, {info['dimension']}D"
     path = info["path"] if info["path"] != info["input"] else None
     shown = {key: value for key, value in info.items() if key not in _HIDDEN}
-    sensors = [_in_degrees(sensor) for sensor in info["sensors"]]
-    yield from format_rows({"made_from": path, **shown, "path": None, "sensors": sensors})
-
-
-def _in_degrees(sensor: dict[str, Any]) -> dict[str, Any]:
-    """A sensor with its angles, which are in rad, as those of its pose and field of view."""
-    angles = {key: sensor[key] for key in ("start_angle", "angle_step") if sensor.get(key)}
-    degrees = {f"{key}_deg": math.degrees(value) for key, value in angles.items()}
-    return {key: value for key, value in sensor.items() if key not in angles} | degrees
+    yield from format_rows({"made_from": path, **shown, "path": None})

@@ -35,7 +35,6 @@ EPILOG = f"""scenes:
 examples:
   stillmap simulate hall -o sim
   stillmap simulate corridor -o sim --people 40 --scans 500 --seed 7
-  stillmap simulate office-empty -o sim --format carmen
   stillmap simulate street -o sim --set traffic.vehicles=3 --json
   stillmap simulate street -o sim --lidar 64 --scans 300 --set lidar.vibration_pitch=0.005
   stillmap simulate hall -o sim --lidar tilting --rate 37.5 --scans 900 --camera
@@ -48,7 +47,6 @@ scene SCENE  one of those listed below
 {OVERWRITE}
 --sessions N  N recordings of the place on as many days: things are moved, brought and taken in
   between, routes, starts and mounts differ
---format {{stillmap,carmen}} = stillmap  a recording folder, or a CARMEN log, recording.log
 --seed N = 0  seed of the random numbers
 {JSON}
 people:
@@ -127,30 +125,20 @@ def run(args: argparse.Namespace) -> int:
 def _simulate(scene: "Scene", args: argparse.Namespace, output: Path) -> list[dict[str, Any]]:
     """Simulate and write; returns the counts of each recording."""
     from stillmap.core.files import require_new, workplace
-    from stillmap.sim import sessions, simulate, simulate_rig, simulator
+    from stillmap.sim import sessions, simulate, simulator
 
-    is_carmen, is_rig = args.format == "carmen", scene.rig.tilts
-    if is_carmen and scene.in_3d:
-        raise InputError("CARMEN logs hold no 3D scans", hint="the recording folder")
     if args.sessions is not None:
-        if is_carmen:
-            hint = "no --format carmen"
-            raise InputError("sessions are written as recording folders", hint=hint)
         require_new(output, sessions.SESSIONS_MARK, args.overwrite)
         plan = sessions.plan_sessions(scene, args.sessions, args.seed)
         with show_share(args.quiet, "simulating") as progress:
             return sessions.write_sessions(
                 [plan], output, seed=args.seed, overwrite=args.overwrite, tell=progress
             )
-    require_new(output, simulator.RIG_MARK if is_rig else simulator.MARK, args.overwrite)
+    require_new(output, simulator.find_marker(scene), args.overwrite)
     with show_share(args.quiet, "simulating") as progress:
-        if is_rig:
-            rig = simulate_rig(scene, args.seed, progress, workplace(output))
-            simulator.write_rig(rig, output, overwrite=args.overwrite)
-            return [simulator.count_beams(part) for part in (rig.horizontal, rig.tilting)]
         made = simulate(scene, args.seed, progress, workplace(output))
-    simulator.write_simulation(made, output, format=args.format, overwrite=args.overwrite)
-    return [simulator.count_beams(made)]
+    simulator.write_simulation(made, output, overwrite=args.overwrite)
+    return [simulator.count_beams(part) for part in made.parts]
 
 
 def _flag_changes(args: argparse.Namespace) -> dict[str, Any]:

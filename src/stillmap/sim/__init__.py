@@ -1,7 +1,7 @@
 """Simulated recordings of places with people, doors and vehicles, with the truth of each beam."""
 
 from stillmap.sim.scene import Scene
-from stillmap.sim.simulator import Simulation, simulate, simulate_rig, write_rig, write_simulation
+from stillmap.sim.simulator import Simulation, simulate, write_simulation
 from stillmap.sim.truth import load_truth
 from stillmap.sim.worlds import SCENES, scene_by_name
 
@@ -12,7 +12,5 @@ __all__ = [
     "load_truth",
     "scene_by_name",
     "simulate",
-    "simulate_rig",
-    "write_rig",
     "write_simulation",
 ]

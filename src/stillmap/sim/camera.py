@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float, Float32, Int32
-from stillmap.core.camera import Camera, Images, unproject
-from stillmap.core.errors import InputError
+from stillmap.core.camera import Camera, Images
 from stillmap.sim.dynamics import Moment
 from stillmap.sim.geometry import BOX, ELLIPSOID, Solids, make_pose, to_local
 from stillmap.sim.options import CameraOptions
@@ -211,36 +210,22 @@ def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
     """The cameras; the center of the first pixel is at (0, 0)."""
     f = 0.5 * o.width / math.tan(0.5 * o.fov)
     K = np.array([[f, 0.0, 0.5 * (o.width - 1)], [0.0, f, 0.5 * (o.height - 1)], [0.0, 0.0, 1.0]])
-    model = "plumb_bob" if o.distortion else ""
     out = []
     for k in range(o.count):
         T = make_pose((0, 0, 0), 0, 0, 2 * math.pi * k / o.count)
         T = T @ make_pose((o.x, o.y, o.z), 0, o.pitch, o.yaw)
         T[:3, :3] = T[:3, :3] @ _AHEAD
         name = f"simulated camera {k}" if o.count > 1 else "simulated camera"
-        distortion = np.array(o.distortion, np.float64)
-        out.append(Camera(name, o.width, o.height, K, model, distortion, T))
+        out.append(Camera(name, o.width, o.height, K, "", np.empty(0), T))
     return tuple(out)
 
 
 def compute_pixel_rays(camera: Camera) -> Float:
-    """(3, height, width) unit ray of each pixel, in the camera frame.
-
-    Raises:
-        InputError: no ray of the lens meets some pixel.
-    """
+    """(3, height, width) unit ray of each pixel, in the camera frame."""
     assert camera.K is not None
     u, v = np.arange(camera.width), np.arange(camera.height)
-    if len(camera.distortion):
-        uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        rays = unproject(camera, uv.astype(float)).T.reshape(3, len(v), len(u))
-        if np.isnan(rays).any():
-            hint = "a smaller camera.fov, or a larger camera.k2"
-            what = "the camera's lens does not reach the corners of its images"
-            raise InputError(what, hint=hint)
-    else:
-        x, y = (u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]
-        rays = np.stack([*np.meshgrid(x, y), np.ones((len(v), len(u)))])
+    x, y = (u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]
+    rays = np.stack([*np.meshgrid(x, y), np.ones((len(v), len(u)))])
     return np.asarray(rays / np.linalg.norm(rays, axis=0))
 
 

@@ -96,7 +96,12 @@ class Sensor(NamedTuple):
         )
 
 
-def make_spinning_lidar(scene: Scene) -> Sensor:
+def make_sensors(scene: Scene) -> tuple[Sensor, ...]:
+    """The lidar of a scene in 3D, or its two lasers, of which the second tilts."""
+    return _make_rig_lasers(scene) if scene.rig.tilts else (_make_spinning_lidar(scene),)
+
+
+def _make_spinning_lidar(scene: Scene) -> Sensor:
     """The lidar of a scene."""
     o, pattern = scene.lidar, Pattern.of(scene.lidar)
     T = make_pose((o.x, o.y, o.z), 0, o.pitch, o.yaw)
@@ -105,7 +110,7 @@ def make_spinning_lidar(scene: Scene) -> Sensor:
     return Sensor("simulated lidar", 3, T, o, lambda _: pattern, o.sweep, leaves_out, own)
 
 
-def make_rig_lasers(scene: Scene) -> tuple[Sensor, Sensor]:
+def _make_rig_lasers(scene: Scene) -> tuple[Sensor, Sensor]:
     """The laser of a scene, mounted horizontally, and an identical one that tilts."""
     o, rig = scene.laser, scene.rig
     angle = laser.compute_beam_angles(o.beams, o.fov)

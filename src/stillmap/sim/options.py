@@ -166,19 +166,8 @@ class CameraOptions:
     z: Positive = option(1.2, "Height above the floor, m.")
     yaw: float = option(0.0, "Yaw of the first camera, rad.")
     pitch: float = option(0.05, "Pitch, nose down, rad.", gt=-math.pi / 2, lt=math.pi / 2)
-    # beyond these limits a lens bends rays back: several would meet one pixel
-    k1: float = option(0.0, "Distortion coefficient (plumb_bob).", ge=-0.4, le=0.4)
-    k2: float = option(0.0, "Distortion coefficient.", ge=-0.4, le=0.4)
-    p1: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
-    p2: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
     noise: NotNegative = option(2.0, "Standard deviation of pixel values, of 255.")
     exposure: NotNegative = option(0.0, "Standard deviation of the relative exposure of images.")
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """Distortion coefficients; empty for an ideal lens."""
-        values = (self.k1, self.k2, self.p1, self.p2)
-        return (*values, 0.0) if any(values) else ()
 
 
 @dataclass(frozen=True, config=STRICT)

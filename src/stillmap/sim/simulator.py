@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -11,17 +10,15 @@ from stillmap.core import se2
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float
 from stillmap.core.arrays import write_npy
-from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
 from stillmap.io import stillmap_folder
-from stillmap.io.carmen.writer import write_log
 from stillmap.io.registry import RIG_FOLDERS
 from stillmap.sim import lidar, truth
 from stillmap.sim.camera import CameraSimulator, Color
 from stillmap.sim.dynamics import Progress
-from stillmap.sim.episode import simulate_episode
+from stillmap.sim.episode import Episode, simulate_episode
 from stillmap.sim.geometry import make_pose
 from stillmap.sim.laser import simulate_measurement
 from stillmap.sim.lidar import Sensor
@@ -30,9 +27,6 @@ from stillmap.sim.scene import Scene
 from stillmap.sim.truth import Truth
 from stillmap.sim.world_3d import STANDING, World
 
-CARMEN_LOG = "recording.log"
-MARK = "truth"  # every simulation has it
-RIG_MARK = "tilting/truth"  # every one of two lasers has it
 _MOTION_SHARE = 0.7  # of the computing time, for progress
 _MOTION_SHARE_3D = 0.05  # the same with a lidar
 
@@ -46,27 +40,22 @@ class Simulation:
         recording: the recording; its images are rendered on access.
         truth: of the beams.
         photographs: the camera images with their truth; None without cameras.
+        tilting: of the scene's tilting laser, in 3D, where `recording` is of the horizontal one;
+            its points are in the frame of the pivot, not of the joint.
+        joint_angle: (T,) rad at each stamp of `tilting`, nose down.
     """
 
     scene: Scene
     recording: Recording
     truth: Truth
     photographs: CameraSimulator | None = None
+    tilting: "Simulation | None" = None
+    joint_angle: Float | None = None
 
-
-@dataclass(frozen=True, eq=False)
-class RigSimulation:
-    """Recordings of a horizontal and a tilting laser in the same world, on one clock.
-
-    Attributes:
-        horizontal: the first, in 2D.
-        tilting: the second, in 3D; its points are in the frame of the pivot, not of the joint.
-        joint_angle: (T,) rad at each stamp of `tilting`, nose down.
-    """
-
-    horizontal: Simulation
-    tilting: Simulation
-    joint_angle: Float
+    @property
+    def parts(self) -> "list[Simulation]":
+        """Itself, and that of a tilting laser."""
+        return [self] if self.tilting is None else [self, self.tilting]
 
 
 def simulate(
@@ -90,61 +79,42 @@ def simulate(
             folder.
 
     Raises:
-        InputError: no room for the robot on its route or for the people, or the robot is held up;
-            or two lasers record, see `simulate_rig`.
+        InputError: no room for the robot on its route or for the people, or the robot is held up.
         OSError: the disk is full.
     """
-    if scene.rig.tilts:
-        raise InputError("a rig of two lasers makes two recordings", hint="simulate_rig")
+    tell = progress or (lambda _: None)
     share = _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
-    rest = _part(progress, share, 1.0)
-    episode = simulate_episode(scene, np.random.default_rng(rng), _part(progress, 0.0, share))
+    episode = simulate_episode(scene, np.random.default_rng(rng), _part(tell, 0.0, share))
     if scene.in_3d:
-        world, sensor = World.of(episode), lidar.make_spinning_lidar(scene)
-        made = _with_images(world, *_record(world, sensor, episode.sensor_rng, rest, scratch))
+        made = _simulate_in_3d(episode, _part(tell, share, 1.0), scratch)
     else:
         made = Simulation(scene, *record_planar(episode))
-    rest(1.0)
+    tell(1.0)
     return made
 
 
-def simulate_rig(
-    scene: Scene,
-    rng: np.random.Generator | int = 0,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> RigSimulation:
-    """Simulate the recordings of a robot with a horizontal and a tilting laser.
-
-    Arguments and errors are those of `simulate`; `scene.rig.tilts` must be set.
-    """
-    if not scene.rig.tilts:
-        raise InputError("no laser of the scene tilts", hint="rig.tilts=true")
-    first, middle = _MOTION_SHARE_3D, (1 + _MOTION_SHARE_3D) / 2
-    episode = simulate_episode(scene, np.random.default_rng(rng), _part(progress, 0.0, first))
-    world, (flat, tilted) = World.of(episode), lidar.make_rig_lasers(scene)
-    below = _record(world, flat, episode.sensor_rng, _part(progress, first, middle), scratch)
-    above = _record(world, tilted, episode.body_rng, _part(progress, middle, 1.0), scratch)
-    # images belong to the 3D recording
-    horizontal, tilting = Simulation(scene, *below), _with_images(world, *above)
-    _part(progress, middle, 1.0)(1.0)
-    stamps = np.arange(len(episode.motion.robot)) / scene.scan_rate
-    return RigSimulation(horizontal, tilting, lidar.compute_joint_angle(stamps, scene.rig))
-
-
-def _part(progress: Progress | None, first: float, last: float) -> Progress:
+def _part(tell: Progress, first: float, last: float) -> Progress:
     """Progress of a part of the whole."""
-    return lambda share: progress(first + (last - first) * share) if progress else None
+    return lambda share: tell(first + (last - first) * share)
 
 
-def _with_images(world: World, recording: Recording, truth: Truth) -> Simulation:
-    """A 3D recording with the images of the scene's cameras, if there are any."""
-    scene = world.episode.scene
-    if not scene.camera.enabled:
-        return Simulation(scene, recording, truth)
-    photographs = CameraSimulator(world)
-    recording = replace(recording, images=photographs.images)
-    return Simulation(scene, recording, truth, photographs)
+def _simulate_in_3d(episode: Episode, tell: Progress, scratch: Path | None) -> Simulation:
+    """The recording of a lidar, or of a horizontal and a tilting laser."""
+    scene = episode.scene
+    world, sensors, made = World.of(episode), lidar.make_sensors(scene), list[Simulation]()
+    for sensor, rng in zip(sensors, (episode.sensor_rng, episode.body_rng), strict=False):
+        first, last = (k / len(sensors) for k in (len(made), len(made) + 1))
+        recorded = _record(world, sensor, rng, _part(tell, first, last), scratch)
+        made.append(Simulation(scene, *recorded))
+    if scene.camera.enabled:  # images belong to the 3D recording
+        photographs = CameraSimulator(world)
+        recording = replace(made[-1].recording, images=photographs.images)
+        made[-1] = replace(made[-1], recording=recording, photographs=photographs)
+    if not scene.rig.tilts:
+        return made[0]
+    stamps = np.arange(len(episode.motion.robot)) / scene.scan_rate
+    joint_angle = lidar.compute_joint_angle(stamps, scene.rig)
+    return replace(made[0], tilting=made[1], joint_angle=joint_angle)
 
 
 def _record(
@@ -202,47 +172,33 @@ def _record(
     return recording, episode.truth(made["static"], made["mover"], T_world_base, more, thing=thing)
 
 
-def write_simulation(
-    simulation: Simulation,
-    path: str | Path,
-    *,
-    format: Literal["stillmap", "carmen"] = "stillmap",
-    overwrite: bool = False,
-) -> None:
+def write_simulation(simulation: Simulation, path: str | Path, *, overwrite: bool = False) -> None:
     """Write recording and truth into one folder that appears complete or not at all.
+
+    What two lasers recorded, one of which tilts, are the folders `horizontal` and `tilting`;
+    `joint_angle.npy` (T,) beside them has the joint's angle in rad at each stamp.
 
     Args:
         simulation: what `simulate` returned.
         path: the folder.
-        format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`.
         overwrite: replace an earlier simulation.
-
-    Raises:
-        InputError: the folder holds something already or cannot be written to, or the format
-            cannot say what the laser measures.
-    """
-    with atomic_folder(Path(path), MARK, overwrite) as work:
-        if format == "carmen":
-            write_log(simulation.recording, work / CARMEN_LOG)
-            truth.write_truth(simulation.truth, simulation.recording.stamp_ns, work)
-        else:
-            write_folder(simulation, work)
-
-
-def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write what two lasers recorded, each with its truth, into one folder.
-
-    `horizontal` and `tilting` are folders as `write_simulation` makes them; `joint_angle.npy` (T,)
-    beside them has the joint's angle in rad at each stamp.
 
     Raises:
         InputError: the folder holds something already or cannot be written to.
     """
-    with atomic_folder(Path(path), RIG_MARK, overwrite) as work:
-        for name, simulation in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
+    with atomic_folder(Path(path), find_marker(simulation.scene), overwrite) as work:
+        if simulation.joint_angle is None:
+            write_folder(simulation, work)
+            return
+        for name, part in zip(RIG_FOLDERS, simulation.parts, strict=True):
             (work / name).mkdir()
-            write_folder(simulation, work / name)
-        write_npy(work / "joint_angle.npy", rig.joint_angle)
+            write_folder(part, work / name)
+        write_npy(work / "joint_angle.npy", simulation.joint_angle)
+
+
+def find_marker(scene: Scene) -> str:
+    """A file that every simulation of such a scene has."""
+    return "tilting/truth" if scene.rig.tilts else "truth"
 
 
 def count_beams(simulation: Simulation) -> dict[str, int]:

@@ -15,7 +15,7 @@ from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.reader import read as read_bags
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import interpret
-from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
+from stillmap.sim import load_truth, scene_by_name, simulate, write_simulation
 from stillmap.sim.laser import compute_beam_angles
 from stillmap.sim.lidar import compute_joint_angle
 from stillmap.sim.options import RigOptions
@@ -36,7 +36,7 @@ def rig():
         "robot": {"scans": 200, "scan_rate": 25.0},
         "crowd": {"people": 25},
     }
-    return simulate_rig(scene_by_name("hall", changes), 5)
+    return simulate(scene_by_name("hall", changes), 5)
 
 
 def scans(messages, recording, frame, laser):
@@ -69,8 +69,8 @@ def joint_messages(messages, rig, joint_ns):
 def bag_of(folder, rig, joint_ns=None, kind="mcap"):
     """A bag of both lasers, odometry, and the joint's transforms."""
     messages = Messages("ros1" if kind == "bag" else "cdr")
-    flat, tilting = rig.horizontal.recording, rig.tilting.recording
-    laser = rig.horizontal.scene.laser
+    flat, tilting = rig.recording, rig.tilting.recording
+    laser = rig.scene.laser
     first, last = int(flat.stamp_ns[0]), int(flat.stamp_ns[-1]) + 100_000_000
     if joint_ns is None:
         joint_ns = np.arange(first, last, JOINT_NS)
@@ -153,7 +153,7 @@ def test_map_command(rig, path, tmp_path):
     out = tmp_path / "out"
     words = ("map", path, "--tilting-topic", "/tilt_scan", "-o", out, "--mesh", *QUICK)
     assert main([str(word) for word in words]) == 0
-    write_rig(rig, tmp_path / "sim")
+    write_simulation(rig, tmp_path / "sim")
     p_static = np.load(out / "tilting/beams/p_static.npy")
     truth = load_truth(tmp_path / "sim" / "tilting")
     known = rig.tilting.recording.hit & ~np.isnan(p_static)

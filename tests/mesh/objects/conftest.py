@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.cli.main import main
-from stillmap.sim import Scene, scene_by_name, simulate, simulate_rig, write_rig, write_simulation
+from stillmap.sim import Scene, scene_by_name, simulate, write_simulation
 from stillmap.sim.options import CameraOptions, CrowdOptions, LidarOptions, RobotOptions
 from stillmap.sim.walls import box
 
@@ -46,7 +46,7 @@ def rig(tmp_path_factory) -> Path:
         "crowd": {"people": 40},
         "camera": {"enabled": True, "width": 96, "height": 72, "rate": 4.0},
     }
-    write_rig(simulate_rig(scene_by_name("hall", changes), 5), path)
+    write_simulation(simulate(scene_by_name("hall", changes), 5), path)
     return path
 
 
