@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial import cKDTree
 
 from stillmap.io.point_cloud import pcd
+from stillmap.io.point_cloud.table import read_columns
 from stillmap.io.trajectory import read_tum, write_tum
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.sim import scene_by_name, simulate, write_simulation
@@ -61,7 +62,7 @@ def test_clouds_keep_the_millimetre(call, mapped, tmp_path):
         assert (done.returncode, done.stderr) == (0, "")
     las = laspy.read(tmp_path / "a.las")
     assert np.abs(las.header.offsets - UTM).max() < 50.0
-    columns = next(pcd.read_columns(pcd.read_header(tmp_path / "a.pcd")[0], ["x", "y", "z"]))
+    columns = next(read_columns(pcd.read_header(tmp_path / "a.pcd")[0], ["x", "y", "z"]))
     for found in (np.asarray(las.xyz), np.stack(columns, axis=1)):
         assert found.dtype == np.float64
         assert found.shape == points.shape

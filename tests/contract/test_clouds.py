@@ -48,7 +48,7 @@ def of_e57(path: Path) -> np.ndarray:
 
 
 def of_pcd(path: Path) -> np.ndarray:
-    blocks = pcd.read_columns(pcd.read_header(path)[0], list(FIELDS))
+    blocks = read_columns(pcd.read_header(path)[0], list(FIELDS))
     rows = [np.stack(columns, axis=1) for columns in blocks]
     return np.concatenate([np.empty((0, len(FIELDS))), *rows])
 

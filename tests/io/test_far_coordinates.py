@@ -5,7 +5,7 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
-from stillmap.io.point_cloud import pcd, ply
+from stillmap.io.point_cloud import pcd, ply, table
 from stillmap.io.trajectory import read_tum, write_tum
 
 UTM = np.array([500_000.0, 5_300_000.0, 800.0])
@@ -33,7 +33,7 @@ def test_a_cloud_is_converted_where_it_was(cloud, tmp_path):
     recording = read(path)
     assert recording.source.origin
     writers.write(recording, tmp_path / "out.ply")
-    columns = list(ply.read_columns(ply.read_layout(tmp_path / "out.ply"), ("x", "y", "z")))
+    columns = list(table.read_columns(ply.read_layout(tmp_path / "out.ply"), ("x", "y", "z")))
     found = np.stack(columns[0], axis=1)
     np.testing.assert_allclose(found, points, rtol=0, atol=1e-4)
 

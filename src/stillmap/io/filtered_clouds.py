@@ -5,11 +5,11 @@ import os
 import re
 import shutil
 import struct
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,11 +93,13 @@ def other_recording_error(path: Path) -> InputError:
     return InputError("is not the recording that was mapped: other scans", where=str(path))
 
 
-_BLOCK_BYTES = 8 << 20  # of points copied at once
-_LABEL = 4  # bytes of a label of SemanticKITTI
-
 # (file, its new copy, (n,) points to remove)
 FilterFile = Callable[[Path, Path, Bool], None]
+
+_LABEL = np.dtype("V4")  # of SemanticKITTI
+# lines of headers with the number of points after group 1
+_PCD_COUNTS = rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+"
+_PLY_COUNTS = rb"(?m)^(\s*element\s+vertex\s+)\d+"
 
 
 def write_kitti(job: FilterJob) -> Omissions:
@@ -109,28 +111,33 @@ def write_kitti(job: FilterJob) -> Omissions:
     Raises:
         InputError: the source has changed since it was read, or the output cannot be written.
     """
+    scans = kitti.list_scans(job.source)
+    labels = [job.source / "labels" / f"{scan.stem}.label" for scan in scans]
 
     def filter_file(path: Path, new: Path, mask: Bool) -> None:
-        _copy_table(kitti.scan_layout(path), new, mask)
-        labels = job.source / "labels" / f"{path.stem}.label"
-        if labels.is_file() and labels.stat().st_size == _LABEL * len(mask):
-            folder = new.parents[len(path.relative_to(job.source).parts) - 1] / "labels"
-            values = np.frombuffer(labels.read_bytes(), f"V{_LABEL}")[~mask]
-            _replace_link(folder)  # through links the source would be written
-            (folder / labels.name).unlink()
-            (folder / labels.name).write_bytes(values.tobytes())
+        if path.suffix == ".label" and path.stat().st_size != _LABEL.itemsize * len(mask):
+            copy_file(path, new)
+        elif path.suffix == ".label":
+            new.write_bytes(np.frombuffer(path.read_bytes(), _LABEL)[~mask].tobytes())
+        elif len(mask):
+            _copy_table(kitti.scan_layout(path), new, mask)
+        else:
+            new.touch()
 
-    files = kitti.list_scans(job.source)
-    return _write_files(job, files, filter_file, write_unread=lambda _, new: new.touch())
+    masks, unread = job.scan_masks(len(scans)), np.zeros(0, np.bool_)
+    known = [unread if mask is None else mask for mask in masks] * 2
+    files = zip([*scans, *labels], known, strict=True)
+    _write_folder(job, {file: mask for file, mask in files if file.is_file()}, filter_file)
+    return Omissions(sum(mask is None for mask in masks))
 
 
 def write_pcd(job: FilterJob) -> Omissions:
     """Copy a PCD file or folder; points of organised clouds become NaN, others are removed."""
 
     def filter_file(path: Path, new: Path, mask: Bool) -> None:
-        _copy_table(pcd.read_header(path)[0], new, mask, rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+")
+        _copy_table(pcd.read_header(path)[0], new, mask, _PCD_COUNTS)
 
-    return _write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
+    return _write_files(job, pcd.EXTENSIONS, filter_file)
 
 
 def write_ply(job: FilterJob) -> Omissions:
@@ -138,58 +145,41 @@ def write_ply(job: FilterJob) -> Omissions:
     faces, may refer to them by their number."""
 
     def filter_file(path: Path, new: Path, mask: Bool) -> None:
-        _copy_table(ply.read_layout(path), new, mask, rb"(?m)^(\s*element\s+vertex\s+)\d+")
+        _copy_table(ply.read_layout(path), new, mask, _PLY_COUNTS)
 
-    return _write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
+    return _write_files(job, ply.EXTENSIONS, filter_file)
 
 
 def write_las(job: FilterJob) -> Omissions:
     """Copy a LAS or LAZ file or folder without some points; version, format and records stay."""
     ending = job.output.suffix.lower()
     packed = ending == ".laz" if job.source.is_file() and ending in las.EXTENSIONS else None
-    filter_file = partial(_filter_las, packed=packed)
-    return _write_files(job, files_of(job.source, las.EXTENSIONS), filter_file)
+    return _write_files(job, las.EXTENSIONS, partial(_filter_las, packed=packed))
 
 
-def _write_files(
-    job: FilterJob,
-    files: Sequence[Path],
-    filter_file: FilterFile,
-    write_unread: Callable[[Path, Path], None] | None = None,
-) -> Omissions:
-    """Write a folder, or one file, with every file of a scan filtered and all others copied.
+def _write_files(job: FilterJob, extensions: tuple[str, ...], filter_file: FilterFile) -> Omissions:
+    """Write the one file, or the folder, of a recording; files that were not read are left out."""
+    files = files_of(job.source, extensions)
+    masks = dict(zip(files, job.scan_masks(len(files)), strict=True))
+    if not job.source.is_file():
+        _write_folder(job, masks, filter_file)
+        return Omissions(sum(mask is None for mask in masks.values()))
+    with atomic_file(job.output) as work:
+        filter_file(job.source, work, job.blank)
+    return Omissions()
 
-    Args:
-        job: see FilterJob.
-        files: those of scans, in the order of the reader.
-        filter_file: writes the copy of a file.
-        write_unread: writes the copy of a file that was not read; None: it is left out.
-    """
-    masks = job.scan_masks(len(files))
-    omissions = Omissions(sum(mask is None for mask in masks))
-    if job.source.is_file():
-        with atomic_file(job.output) as work:
-            if masks[0] is not None:
-                _write_file(files[0], work, masks[0], filter_file, job.output.suffix)
-        return omissions
+
+def _write_folder(
+    job: FilterJob, masks: Mapping[Path, Bool | None], filter_file: FilterFile
+) -> None:
+    """Write a folder with the files that have masks filtered, without those that have none, and
+    with all others copied."""
     with atomic_folder(job.output, job.marker, job.overwrite) as folder:
-        _copy_others(job.source, folder, set(files), job.omit)
-        for number, (file, mask) in enumerate(zip(files, masks, strict=True)):
-            new = folder / file.relative_to(job.source)
+        _copy_others(job.source, folder, masks.keys(), job.omit)
+        for number, (file, mask) in enumerate(masks.items(), start=1):
             if mask is not None:
-                _write_file(file, new, mask, filter_file, file.suffix)
-            elif write_unread is not None:
-                write_unread(file, new)
-            job.report((number + 1) / len(files))
-    return omissions
-
-
-def _write_file(file: Path, new: Path, mask: Bool, filter_file: FilterFile, suffix: str) -> None:
-    """Write the copy of a file; the file itself where no beam is blanked and `suffix` is its."""
-    if not mask.any() and file.suffix.lower() == suffix.lower():
-        copy_file(file, new)
-    else:
-        filter_file(file, new, mask)
+                filter_file(file, folder / file.relative_to(job.source), mask)
+            job.report(number / len(masks))
 
 
 def _copy_others(
@@ -212,16 +202,6 @@ def _copy_others(
             _copy_others(entry, new, files, omit)
         elif entry.is_file():
             copy_file(entry, new)
-
-
-def _replace_link(folder: Path) -> None:
-    """Replace a link to a folder by a folder of links to what that holds."""
-    if folder.is_symlink():
-        entries = list(folder.resolve().iterdir())
-        folder.unlink()
-        folder.mkdir()
-        for entry in entries:
-            (folder / entry.name).symlink_to(entry)
 
 
 def _filter_las(path: Path, new: Path, mask: Bool, packed: bool | None) -> None:
@@ -259,73 +239,60 @@ def _copy_table(layout: TableLayout, new: Path, mask: Bool, counts: bytes = b"()
     """
     if layout.rows != len(mask):
         raise other_recording_error(layout.path)
-    copy = _copy_lines if layout.text else _copy_records
-    copy = _copy_columns if layout.compressed else copy
     with InputFile(layout.path) as source, new.open("wb") as target:
         header = source.read(layout.header)
+        lines = layout.lines - header.count(b"\n")
         if header and not layout.ordered:
             header = re.sub(counts, rb"\g<1>%d" % np.count_nonzero(~mask), header)
         target.write(header)
-        copy(source, target, layout, mask)
+        if layout.text:
+            target.writelines(source.readline() for _ in range(lines))
+            _copy_lines(source, target, layout, mask)
+        else:
+            target.write(source.read(layout.start - layout.header))
+            _copy_records(source, target, layout, mask)
         shutil.copyfileobj(source, target)
 
 
-def _unknown(dtype: np.dtype[Any]) -> Any:
-    """The value of a coordinate that is not known."""
-    return np.nan if dtype.kind == "f" else 0
-
-
-def _blank_records(
-    layout: TableLayout, records: NDArray[np.uint8], removed: Bool
-) -> NDArray[np.uint8]:
-    """Records (n, size) without those of a mask, or without their coordinates."""
-    if not layout.ordered:
-        return records[~removed]
-    records = records.copy()
-    for field, byte, _ in map(layout.find_column, "xyz"):
-        value = np.array(_unknown(field.dtype), field.dtype)
-        records[removed, byte : byte + value.itemsize] = np.frombuffer(value.tobytes(), np.uint8)
-    return records
-
-
 def _copy_records(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
-    target.write(source.read(layout.start - layout.header))
-    step = max(1, _BLOCK_BYTES // layout.record)
-    for first in range(0, len(mask), step):
-        removed = mask[first : first + step]
-        rows = np.frombuffer(source.read(len(removed) * layout.record), np.uint8)
-        if len(rows) < len(removed) * layout.record:
-            raise table.truncated_error(layout.path)
-        target.write(_blank_records(layout, rows.reshape(len(removed), -1), removed).tobytes())
+    first = 0
+    for records in table.iter_records(layout):
+        removed = mask[first : first + len(records)]
+        first += len(records)
+        if not layout.ordered:
+            records = records[~removed]
+        else:
+            records = records.copy()
+            for axis in "xyz":
+                records[axis][removed] = _unknown(layout, axis)
+        target.write(_pack(records, layout.path) if layout.compressed else records.tobytes())
+    packed_size = int.from_bytes(source.read(8)[:4], "little") if layout.compressed else 0
+    source.seek(packed_size or layout.rows * layout.dtype.itemsize, os.SEEK_CUR)
 
 
-def _copy_columns(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
-    records = _blank_records(layout, np.hstack(pcd.unpack_columns(layout)), mask)
-    ends = np.cumsum([field.size for field in layout.fields])[:-1]
-    data = b"".join(column.tobytes() for column in np.hsplit(records, ends))
+def _unknown(layout: TableLayout, axis: str) -> float:
+    """The value of a coordinate that is not known."""
+    return np.nan if layout.dtype[axis].base.kind == "f" else 0
+
+
+def _pack(records: NDArray[np.void], path: Path) -> bytes:
+    data = b"".join(records[name].tobytes() for name in records.dtype.names or ())
     # room for more bytes than LZF makes of any data: else it refuses what it cannot shorten
     room = len(data) + len(data) // 8 + 64
-    packed = import_extra("lzf", layout.path).compress(data, room) if data else b""
-    target.write(struct.pack("<II", len(packed), len(data)) + packed)
-    source.seek(int.from_bytes(source.read(8)[:4], "little"), 1)
+    packed = import_extra("lzf", path).compress(data, room) if data else b""
+    return struct.pack("<II", len(packed), len(data)) + packed
 
 
 def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
-    source.seek(0)
-    header_lines, row = source.read(layout.header).count(b"\n"), 0
-    for _ in range(layout.lines - header_lines):
-        target.write(source.readline())
-    columns = map(layout.find_column, "xyz")
-    unknown = {value: b"%g" % _unknown(field.dtype) for field, _, value in columns}
+    unknown = {layout.count_values(axis): b"%g" % _unknown(layout, axis) for axis in "xyz"}
+    row = 0
     while row < len(mask):
         line = source.readline()
         if not line:
             raise table.truncated_error(layout.path)
-        if table.is_blank(line):
-            target.write(line)
-            continue
-        if not mask[row]:
+        is_point = not table.is_blank(line)
+        if not (is_point and mask[row]):
             target.write(line)
         elif layout.ordered:
             target.write(replace_words(line, unknown))
-        row += 1
+        row += is_point

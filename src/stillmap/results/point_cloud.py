@@ -164,7 +164,7 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
         if only in (part, None)
     ]
     colors = {name for name, _ in COLOURS}
-    has_colors = all(colors <= {one.name for one in layout.fields} for layout in layouts)
+    has_colors = all(colors <= set(layout.dtype.names or ()) for layout in layouts)
     wanted = [name for name, _ in FIELDS + (COLOURS if has_colors else [])]
 
     def make_blocks() -> Iterator[Block]:
@@ -187,7 +187,8 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
 def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
     """(3,) whole m near the points of files; zero where they are 32-bit, and so near it."""
     for layout in layouts:
-        is_double = all(one.dtype == np.float64 for one in layout.fields if one.name in "xyz")
+        dtype = layout.dtype
+        is_double = all(dtype[axis] == np.float64 for axis in dtype.names or () if axis in "xyz")
         if is_double and layout.rows:
             x, y, z = next(iter(read_columns(layout, ("x", "y", "z"))))
             first = np.array([x[0], y[0], z[0]])
@@ -263,7 +264,7 @@ def append_vertices(path: Path, block: Block) -> None:
         InputError: it is damaged.
     """
     layout, whole = ply.read_layout(path), path.with_suffix(".whole")
-    fields = [(one.name, one.dtype.str.lstrip("|")) for one in layout.fields]
+    fields = [(name, layout.dtype[name].str.lstrip("|")) for name in layout.dtype.names or ()]
     with path.open("rb") as before, whole.open("wb") as file:
         file.write(ply_header(fields, layout.rows + len(block.points)))
         before.seek(layout.start)

@@ -28,15 +28,14 @@ from stillmap.io.point_cloud.clouds import (
     scan_hits,
     sensor_poses,
 )
-from stillmap.io.point_cloud.table import Field, TableLayout, parse_numbers
+from stillmap.io.point_cloud.table import TableLayout, parse_numbers
 from stillmap.io.text_lines import assign_rows, list_files, read_times, stamp_files
 from stillmap.io.trajectory import pose_from_row, rigid_transform
 
 MARKER = "times.txt"  # only folders with this file are overwritten
 
 _EARTH = 6378137.0  # m
-_FIELDS = tuple(Field(name, np.dtype("<f4")) for name in ("x", "y", "z", "reflectance"))
-_RECORD = 16  # bytes of a point
+_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "reflectance")])
 _CAMERA_FOLDER = re.compile(r"image_0?([0-3])")
 _RAW = Path("velodyne_points/data")
 _LAYOUTS = (  # scans and their stamps
@@ -122,9 +121,9 @@ def scan_layout(path: Path) -> TableLayout:
         InputError: it is empty, or ends within a point.
     """
     with table.open_table(path) as file:
-        if file.size % _RECORD:
+        if file.size % _POINT.itemsize:
             raise table.truncated_error(path)
-        return TableLayout(path, _FIELDS, file.size // _RECORD)
+        return TableLayout(path, _POINT, file.size // _POINT.itemsize)
 
 
 def _read_scan(path: Path, T: Float | None) -> Cloud:

@@ -1,11 +1,8 @@
 """PCD files: single clouds, or folders of one file per scan; read and written here.
 
-Text, binary and compressed columns. Only the LZF decompression is a library's; the reason is in
-CONTRIBUTING.md.
+Text, binary and compressed columns.
 """
 
-import struct
-from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,9 +12,8 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float
-from stillmap.core.errors import InputError, import_extra
+from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
-from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
@@ -29,16 +25,17 @@ from stillmap.io.point_cloud.clouds import (
     scan_hits,
     sensor_poses,
 )
-from stillmap.io.point_cloud.table import Columns, Field, TableLayout
+from stillmap.io.point_cloud.table import TableLayout
 from stillmap.io.trajectory import pose_from_quaternion, quaternion_from_pose
 
 EXTENSIONS = (".pcd",)
 MARKER = "*.pcd"  # only folders with such a file are overwritten
 
 _MAX_HEADER = 1 << 14  # bytes
-_TYPES = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
-_MAX_UNPACKED = 1 << 30  # bytes
-_MAX_EXPANSION = 100  # unpacked over packed bytes: LZF reaches a little less
+_TYPES = {  # by TYPE and SIZE
+    **{("F", size): f"<f{size}" for size in ("4", "8")},
+    **{(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in ("1", "2", "4", "8")},
+}
 _MIN_VIEWPOINT_DISTANCE = 5.0  # m from the origin, to detect the frame of the points
 
 
@@ -77,11 +74,8 @@ def read_header(path: Path) -> Header:
 def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: int) -> Header:
     names, kinds, sizes = entries["FIELDS"], entries["TYPE"], entries["SIZE"]
     counts = [int(word) for word in entries.get("COUNT", ["1"] * len(names))]
-    dtypes = [
-        np.dtype(f"<{kind.lower()}{_TYPES[kind][_TYPES[kind].index(size)]}")
-        for kind, size in zip(kinds, sizes, strict=True)
-    ]
-    fields = tuple(Field(*column) for column in zip(names, dtypes, counts, strict=True))
+    types = [_TYPES[kind, size] for kind, size in zip(kinds, sizes, strict=True)]
+    dtype = table.record_type(list(zip(names, types, counts, strict=True)))
     height = entries.get("HEIGHT", ["1"])[0]
     rows = int(entries["POINTS"][0]) if "POINTS" in entries else -1
     if rows < 0:
@@ -91,7 +85,7 @@ def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: 
         raise ValueError(f"{rows} points, DATA {kind[:20]}")
     is_text, is_compressed = kind == "ascii", kind == "binary_compressed"
     ordered = height != "1"
-    layout = TableLayout(path, fields, rows, start, start, lines, is_text, is_compressed, ordered)
+    layout = TableLayout(path, dtype, rows, start, start, lines, is_text, is_compressed, ordered)
     return layout, _parse_viewpoint(entries.get("VIEWPOINT"))
 
 
@@ -103,50 +97,6 @@ def _parse_viewpoint(words: list[str] | None) -> Float | None:
         return pose_from_quaternion(wxyz, (x, y, z))
     except (ValueError, IndexError):
         return None
-
-
-def unpack_columns(layout: TableLayout) -> list[NDArray[np.uint8]]:
-    """The columns of a compressed file, bytes (n, size) each.
-
-    Raises:
-        InputError: the compressed part is damaged or too large.
-    """
-    rows, path = layout.rows, layout.path
-    size = rows * layout.record
-    if size > _MAX_UNPACKED:
-        what = f"is too large: more than {_MAX_UNPACKED >> 20} MiB when unpacked"
-        raise InputError(what, where=str(path))
-    with InputFile(path) as file:
-        file.seek(layout.start)
-        sizes = file.read(8).ljust(8, b"\0")
-        packed_size, unpacked_size = struct.unpack("<II", sizes)
-        packed = file.read(min(packed_size, file.size))
-    if len(packed) < packed_size or unpacked_size < size:
-        raise table.truncated_error(path)
-    data = b""
-    if size and unpacked_size == size <= _MAX_EXPANSION * packed_size:
-        try:
-            data = import_extra("lzf", path).decompress(packed, size) or b""
-        except ValueError:
-            data = b""
-    if len(data) != size:
-        raise InputError("is damaged: its compressed part", where=str(path))
-    columns, at = [], 0
-    for field in layout.fields:
-        column = np.frombuffer(data, np.uint8, rows * field.size, at)
-        columns.append(column.reshape(rows, field.size))
-        at += rows * field.size
-    return columns
-
-
-def read_columns(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
-    """Yield values (k,) of the named columns, block by block; see `table.read_columns`."""
-    if not layout.compressed:
-        yield from table.read_columns(layout, names)
-        return
-    fields = [layout.find_column(name)[0] for name in names]
-    columns = unpack_columns(layout)
-    yield [columns[layout.fields.index(field)].view(field.dtype)[:, 0] for field in fields]
 
 
 def read(path: Path, context: ReadContext) -> Recording:
@@ -176,7 +126,7 @@ def read(path: Path, context: ReadContext) -> Recording:
 def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
     layout, T = read_header(path)
     T_sensor_map = np.eye(4) if T is None or not in_map_frame else se2.inverse(T)
-    time = table.find_time_column(field.name for field in layout.fields)
+    time = table.find_time_column(layout.dtype.names or ())
     names = ["x", "y", "z", *([time] if time else [])]
 
     def to_sensor(points: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -186,8 +136,7 @@ def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
             return points
         return points.astype(np.float64) @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3]
 
-    blocks = read_columns(layout, names)
-    points, times = table.gather_points(blocks, to_sensor)
+    points, times = table.gather_points(table.read_columns(layout, names), to_sensor)
     return Cloud(points, T, times[0] if times else None)
 
 

@@ -1,7 +1,4 @@
-"""PLY point clouds: single files or folders; read and written here.
-
-The reason is in CONTRIBUTING.md.
-"""
+"""PLY point clouds: single files or folders; read and written here."""
 
 from pathlib import Path
 
@@ -14,11 +11,11 @@ from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import Cloud, Origin, iter_map_points, read_clouds
 from stillmap.io.point_cloud.table import (
-    Field,
     TableLayout,
     gather_points,
     open_table,
     read_columns,
+    record_type,
     split_header,
 )
 
@@ -72,27 +69,31 @@ def read_layout(path: Path) -> TableLayout:
 
 def _parse_header(path: Path, lines: list[list[str]], header: int) -> TableLayout:
     encoding, order = "", ""
-    elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list property
+    elements: list[tuple[str, int, list[tuple[str, str, int]]]] = []
+    with_lists: set[str] = set()
     for words in lines[1:-1]:
         if words[:1] == ["format"]:
             encoding, order = words[1], _ORDERS[words[1]]
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            is_list = words[1] == "list"
-            field = None if is_list else Field(words[2], np.dtype(order + _TYPES[words[1]]))
-            elements[-1][2].append(field)
+            if words[1] == "list":
+                with_lists.add(elements[-1][0])
+            else:
+                elements[-1][2].append((words[2], order + _TYPES[words[1]], 1))
     text, start, before = encoding == "ascii", header, len(lines)
-    for name, rows, fields in elements:
+    for name, rows, columns in elements:
         if rows < 0:
             raise ValueError("a negative count of points")
-        plain = tuple(field for field in fields if field is not None)
-        if len(plain) < len(fields) and (name == "vertex" or not text):
+        if name in with_lists and (name == "vertex" or not text):
             raise ValueError("its vertices have list properties, or follow such")
         if name == "vertex":
-            indexed = any(count > 0 for element, count, _ in elements if element != name)
-            return TableLayout(path, plain, rows, header, start, before, text, ordered=indexed)
-        start += rows * sum(field.size for field in plain)
+            indexed, dtype = (
+                any(n > 0 for one, n, _ in elements if one != name),
+                record_type(columns),
+            )
+            return TableLayout(path, dtype, rows, header, start, before, text, ordered=indexed)
+        start += rows * sum(np.dtype(kind).itemsize for _, kind, _ in columns)
         before += rows
     raise ValueError("no vertices")
 

@@ -3,7 +3,9 @@
 Counts in a header are checked against the size of the file before memory is allocated.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -14,13 +16,15 @@ from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, import_extra
 from stillmap.core.input_files import InputFile
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.text_lines import read_lines
 
 _BLOCK = 1 << 18  # points read at once
 _MAX_RECORD = 1 << 16  # bytes of one point
+_MAX_UNPACKED = 1 << 30  # bytes
+_MAX_EXPANSION = 100  # unpacked over packed bytes: LZF reaches a little less
 
 _TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
 _UNITS = (1, 10**3, 10**6, 10**9)  # per second: s, ms, us, ns
@@ -34,36 +38,23 @@ Columns = Sequence[NDArray[Any]]  # values (k,) of each column
 
 
 @dataclass(frozen=True)
-class Field:
-    """A column: name, type with byte order, and count of values per point."""
-
-    name: str
-    dtype: np.dtype[Any]
-    count: int = 1
-
-    @property
-    def size(self) -> int:
-        return self.dtype.itemsize * self.count
-
-
-@dataclass(frozen=True)
 class TableLayout:
     """Position and columns of the points in a file.
 
     Attributes:
         path: the file.
-        fields: the columns in order.
+        dtype: of a point, with the columns by name; see `record_type`.
         rows: point count of the header; negative: text up to the end of the file.
         header: bytes of the header.
         start: byte offset of the first point.
         lines: line count before the first point, of text.
         text: points are text, one line each.
-        compressed: columns follow each other, in one compressed block.
+        compressed: columns follow each other, in one block compressed by LZF.
         ordered: points are found by their number: none can be taken out.
     """
 
     path: Path
-    fields: tuple[Field, ...]
+    dtype: np.dtype[Any]
     rows: int
     header: int = 0
     start: int = 0
@@ -72,30 +63,31 @@ class TableLayout:
     compressed: bool = False
     ordered: bool = False
 
-    @property
-    def record(self) -> int:
-        """Bytes of one point.
+    def count_values(self, name: str) -> int:
+        """Number of values of a point before those of a column."""
+        names = self.dtype.names or ()
+        shapes = (self.dtype[before].shape for before in names[: names.index(name)])
+        return sum(int(np.prod(shape)) for shape in shapes)
 
-        Raises:
-            InputError: none or implausibly many.
-        """
-        size = sum(field.size for field in self.fields)
-        if not 0 < size <= _MAX_RECORD:
-            raise InputError(f"is damaged: a point of {size} bytes", where=str(self.path))
-        return size
 
-    def find_column(self, name: str) -> tuple[Field, int, int]:
-        """The first column of a name, its byte offset and its value index within a point.
+def record_type(columns: Sequence[tuple[str, DTypeLike, int]]) -> np.dtype[Any]:
+    """The type of points with columns of a name, a type and a count of values each.
 
-        Raises:
-            InputError: there is no such column.
-        """
-        byte = value = 0
-        for field in self.fields:
-            if field.name == name:
-                return field, byte, value
-            byte, value = byte + field.size, value + field.count
-        raise InputError(f"has no column '{name}'", where=str(self.path))
+    The first of several columns keeps their name.
+
+    Raises:
+        ValueError: a point has no bytes, or implausibly many.
+    """
+    size = sum(np.dtype(kind).itemsize * count for _, kind, count in columns)
+    if not 0 < size <= _MAX_RECORD:
+        raise ValueError(f"a point of {size} bytes")
+    first = {name: k for k, (name, *_) in reversed(list(enumerate(columns)))}
+    return np.dtype(
+        [
+            (name if first[name] == k else f"{name} {k}", kind, (count,) if count > 1 else ())
+            for k, (name, kind, count) in enumerate(columns)
+        ]
+    )
 
 
 def read_columns(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
@@ -104,8 +96,73 @@ def read_columns(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]
     Raises:
         InputError: a column is missing, or the file is truncated or damaged.
     """
-    blocks = _read_text(layout, names) if layout.text else _read_records(layout, names)
+    for name in names:
+        if name not in (layout.dtype.names or ()):
+            raise InputError(f"has no column '{name}'", where=str(layout.path))
+    blocks = _read_text(layout, names)
+    if not layout.text:
+        blocks = ([_values(block[name]) for name in names] for block in iter_records(layout))
     return require_all(blocks, layout.rows, layout.path)
+
+
+def _values(column: NDArray[Any]) -> NDArray[Any]:
+    """The first value of each row."""
+    return column if column.ndim == 1 else column[:, 0]
+
+
+def _read_text(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
+    numbers = list(map(layout.count_values, names))
+    lines = iter_text_lines(layout.path, layout.lines)
+    lines = lines if layout.rows < 0 else islice(lines, layout.rows)
+    while len(block := parse_numbers(lines, _BLOCK, numbers, layout.path)):
+        yield list(block.T)
+
+
+def iter_records(layout: TableLayout) -> Iterator[NDArray[np.void]]:
+    """Yield the points (k,) of a file that is no text, block by block.
+
+    Raises:
+        InputError: the file is truncated or damaged.
+    """
+    size, rows = layout.dtype.itemsize, layout.rows
+    with InputFile(layout.path) as file:
+        if layout.compressed:
+            file.seek(layout.start)
+            yield _unpack(file, layout)
+            return
+        if file.size < layout.start + rows * size:
+            raise truncated_error(layout.path)
+        file.seek(layout.start)
+        for first in range(0, rows, _BLOCK):
+            yield np.frombuffer(file.read(min(_BLOCK, rows - first) * size), layout.dtype)
+
+
+def _unpack(file: InputFile, layout: TableLayout) -> NDArray[np.void]:
+    """The points of a compressed file.
+
+    Raises:
+        InputError: the compressed part is damaged or too large, or lzf is missing.
+    """
+    size, path = layout.rows * layout.dtype.itemsize, layout.path
+    if size > _MAX_UNPACKED:
+        what = f"is too large: more than {_MAX_UNPACKED >> 20} MiB when unpacked"
+        raise InputError(what, where=str(path))
+    packed_size, unpacked_size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+    packed, data = file.read(min(packed_size, file.size)), b""
+    if len(packed) < packed_size or unpacked_size < size:
+        raise truncated_error(path)
+    if size and unpacked_size == size <= _MAX_EXPANSION * packed_size:
+        with suppress(ValueError):
+            data = import_extra("lzf", path).decompress(packed, size) or b""
+    if len(data) != size:
+        raise InputError("is damaged: its compressed part", where=str(path))
+    records, at = np.empty(layout.rows, layout.dtype), 0
+    for name in layout.dtype.names or ():
+        column = records[name]
+        values = np.frombuffer(data, column.dtype, column.size, at)
+        records[name] = values.reshape(column.shape)
+        at += column.nbytes
+    return records
 
 
 def require_all(blocks: Iterable[Columns], rows: int, path: Path) -> Iterator[Columns]:
@@ -176,36 +233,6 @@ def split_header(
         lines.append(head[start:end].decode("ascii", "replace").split())
         start = end + 1
     return lines, start
-
-
-def record_dtype(columns: Mapping[str, tuple[DTypeLike, int]], size: int) -> np.dtype[Any]:
-    """The type of records of `size` bytes, with (type, byte offset) of columns by name."""
-    kinds, offsets = zip(*columns.values(), strict=True)
-    return np.dtype(
-        {"names": list(columns), "formats": kinds, "offsets": offsets, "itemsize": size}
-    )
-
-
-def _read_records(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
-    columns = [layout.find_column(name) for name in names]
-    by_name = {str(i): (field.dtype, byte) for i, (field, byte, _) in enumerate(columns)}
-    size, rows = layout.record, layout.rows
-    dtype = record_dtype(by_name, size)
-    with InputFile(layout.path) as file:
-        if file.size < layout.start + rows * size:
-            raise truncated_error(layout.path)
-        file.seek(layout.start)
-        for first in range(0, rows, _BLOCK):
-            records = np.frombuffer(file.read(min(_BLOCK, rows - first) * size), dtype)
-            yield [records[name] for name in by_name]
-
-
-def _read_text(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
-    numbers = [layout.find_column(name)[2] for name in names]
-    lines = iter_text_lines(layout.path, layout.lines)
-    lines = lines if layout.rows < 0 else islice(lines, layout.rows)
-    while len(block := parse_numbers(lines, _BLOCK, numbers, layout.path)):
-        yield list(block.T)
 
 
 def iter_text_lines(path: Path, skip: int = 0) -> Iterator[bytes]:

@@ -16,7 +16,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import Cloud, CloudSource, build_recording, files_of
-from stillmap.io.point_cloud.table import Field, TableLayout, is_blank, read_columns, require_all
+from stillmap.io.point_cloud.table import TableLayout, is_blank, read_columns, require_all
 from stillmap.io.text_lines import read_lines, strip_extension
 from stillmap.io.trajectory import rigid_transform
 
@@ -28,7 +28,7 @@ _METRES = 0.01
 _CODE_WIDTH, _CODE_GAP, _MIN_CODE_SHARE = 0.012, 0.3, 0.001
 # rotation from the axes of 3DTK to ours
 _AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_FIELDS = tuple(Field(name, np.dtype("<f8")) for name in "xyz")
+_POINT = np.dtype([(name, "<f8") for name in "xyz"])
 
 
 def read(path: Path, context: ReadContext) -> Recording:
@@ -68,7 +68,7 @@ def _find_max_range_code(files: list[Path]) -> float | None:
 
 def _read_cloud(path: Path) -> Cloud:
     lines, rows = _read_heading(path)
-    layout = TableLayout(path, _FIELDS, -1, lines=lines, text=True)
+    layout = TableLayout(path, _POINT, -1, lines=lines, text=True)
     columns = require_all(read_columns(layout, "xyz"), rows, path)
     blocks = [np.stack(block, axis=1) for block in columns]
     points = np.concatenate([np.empty((0, 3)), *blocks])

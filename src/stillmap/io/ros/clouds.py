@@ -21,7 +21,6 @@ from stillmap.io.point_cloud.table import (
     convert_times,
     detect_clock,
     find_time_column,
-    record_dtype,
 )
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
@@ -46,16 +45,16 @@ class CloudLayout(NamedTuple):
     """The layout of the points in the data of a message.
 
     Attributes:
-        columns: type and byte offset of the fields that are read, by name in lower case.
+        dtype: of a point, with the fields that are read by name in lower case.
         time: name of the time field; None: there is none.
         shape: rows and columns of points.
-        strides: bytes from row to row, and from point to point.
+        row_step: bytes from row to row.
     """
 
-    columns: dict[str, tuple[str, int]]
+    dtype: np.dtype[Any]
     time: str | None
     shape: tuple[int, int]
-    strides: tuple[int, int]
+    row_step: int
 
     @property
     def n_points(self) -> int:
@@ -64,8 +63,8 @@ class CloudLayout(NamedTuple):
 
     def view(self, data: NDArray[np.uint8]) -> NDArray[Any]:
         """The fields that are read, (rows, columns), as a view of the data of a message."""
-        dtype = record_dtype(self.columns, self.strides[1])
-        return np.ndarray(self.shape, dtype, data, strides=self.strides)
+        strides = self.row_step, self.dtype.itemsize
+        return np.ndarray(self.shape, self.dtype, data, strides=strides)
 
 
 def find_layout(message: Any) -> CloudLayout | str:
@@ -88,7 +87,11 @@ def find_layout(message: Any) -> CloudLayout | str:
                 columns[name] = f"{order}{kind}", offset
     if not columns.keys() >= set("xyz"):
         return NO_COORDINATES
-    return CloudLayout(columns, time if time in columns else None, (height, width), (row, step))
+    kinds, offsets = zip(*columns.values(), strict=True)
+    dtype = np.dtype(
+        {"names": list(columns), "formats": kinds, "offsets": offsets, "itemsize": step}
+    )
+    return CloudLayout(dtype, time if time in columns else None, (height, width), row)
 
 
 def parse_cloud(message: Any) -> Cloud | str:

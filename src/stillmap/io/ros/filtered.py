@@ -149,7 +149,7 @@ def _blank_points(cloud: Any, mask: Bool, topic: str) -> None:
             points[axis][mask.reshape(layout.shape)] = np.nan if is_float else 0
         cloud.data, cloud.is_dense = data, False
         return
-    step = layout.strides[1]
+    step = layout.dtype.itemsize
     end, removed = len(mask) * step, int(np.count_nonzero(mask))
     kept = data[:end].reshape(-1, step)[~mask].reshape(-1)
     cloud.data = np.concatenate([kept, data[end:]])
