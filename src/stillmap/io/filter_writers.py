@@ -14,7 +14,6 @@ import numpy as np
 
 from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.core.recording import Recording
@@ -37,18 +36,16 @@ _OF_RANGES = ("stillmap", "carmen", "ros2", "bag", "db3", "mcap")  # they hold m
 
 
 class FilterTarget(NamedTuple):
-    """Format and writer of a filtered recording.
+    """Writer of a filtered recording.
 
     Attributes:
-        description: of the format, in words.
-        marker: see FilterJob.
         write: writes it.
+        marker: see FilterJob.
         writer: of another format than the recording's own; None: its own.
     """
 
-    description: str
-    marker: str
     write: Write
+    marker: str
     writer: writers.Writer | None = None
 
     @property
@@ -95,43 +92,31 @@ def find_target(source: Path | None, output: Path, name: str | None = None) -> F
         InputError: there is no such format, or the recording cannot be written so.
     """
     if source is None:
-        return _make_target(writers.find_writer(output, name))
-    form, given = detect_format(source).name, name or writers.format_of_ending(output)
-    if form not in _OWN:
-        if given is None:
-            _require_ending(output, ())
-        note = f"a recording of the format {form} is not written again: it comes back as "
-        return _make_target(writers.find_writer(output, given or "pcd"), note)
-    own, marker, write = _OWN[form]
-    own = detect_kind(source)[0] if form == "ROS bag" else own
+        return _convert_to(writers.find_writer(output, name))
+    form, given = detect_format(source), name or writers.format_of_ending(output)
+    own, marker, write = _OWN.get(form.name, ("", "", _write_stillmap))
+    own = detect_kind(source)[0] if form.name == "ROS bag" else own
     is_folder = _is_folder(source)
-    if given is not None:
-        writer = writers.find_writer(output, given)
-        if own in _ROS2 and writer.name in _ROS2:
-            own, is_folder = writer.name, bool(writer.marker)
-        elif writer.name != own or bool(writer.marker) != is_folder:
-            return _make_target(writer)
-    elif is_folder or form != "CARMEN log":
-        _require_ending(output, () if is_folder else _endings(form))
-
-    def write_own(job: FilterJob) -> Omissions:
-        return write(replace(job, kind=own))
-
-    return FilterTarget(form, marker if is_folder else "", write_own)
+    writer = None if given is None else writers.find_writer(output, given)
+    if writer is None and form.name != "CARMEN log":
+        _require_ending(output, () if is_folder or not own else form.endings)
+    if not own:
+        note = f"a recording of the format {form.name} is not written again: it comes back as "
+        return _convert_to(writer or writers.find_writer(output, "pcd"), note)
+    if writer is not None and own in _ROS2 and writer.name in _ROS2:
+        own, is_folder = writer.name, bool(writer.marker)
+    elif writer is not None and (writer.name != own or bool(writer.marker) != is_folder):
+        return _convert_to(writer)
+    return FilterTarget(lambda job: write(replace(job, kind=own)), marker if is_folder else "")
 
 
-def _make_target(writer: writers.Writer, note: str = "") -> FilterTarget:
+def _convert_to(writer: writers.Writer, note: str = "") -> FilterTarget:
     """The target that another format than the recording's own is."""
-    write = partial(_convert, writer=writer, note=note)
-    return FilterTarget(writer.description, writer.marker, write, writer)
+    return FilterTarget(partial(_convert, writer=writer, note=note), writer.marker, writer)
 
 
 def _is_folder(source: Path) -> bool:
     return source.is_dir() or source.name == stillmap_folder.HEADER
-
-
-def _endings(form: str) -> tuple[str, ...]:
-    return next(known.endings for known in FORMATS if known.name == form)
 
 
 def _require_ending(output: Path, endings: tuple[str, ...]) -> None:
@@ -189,22 +174,19 @@ def _to_misses(job: FilterJob) -> Recording:
 
 def _without_beams(job: FilterJob) -> Recording:
     """The recording without the blanked beams."""
-    recording, scratch = job.recording, workplace(job.output)
-    columns = {"points": recording.points, "hit": recording.hit, "beam_time": recording.beam_time}
-    kept = {
-        name: ArrayBuilder(column.dtype, column.shape[1:], scratch)
-        for name, column in columns.items()
-        if column is not None
-    }
+    recording, blank = job.recording, job.blank
     length = np.zeros(recording.n_scans + 1, np.int64)
-    for scan in recording.iter_scans(range(recording.n_scans), job.blank):
-        beams = recording.beams_of(scan)
-        stays: Bool = ~job.blank[beams]
-        for name, builder in kept.items():
-            builder.append(getattr(recording, name)[beams][stays])
-        length[scan + 1] = np.count_nonzero(stays)
-    finished: dict[str, Any] = {name: builder.finish() for name, builder in kept.items()}
-    return replace(recording, offset=np.cumsum(length), **finished)
+    for scan in recording.iter_scans(range(recording.n_scans), blank):
+        length[scan + 1] = np.count_nonzero(~blank[recording.beams_of(scan)])
+    kept: dict[str, Any] = {"offset": np.cumsum(length)}
+    for name in ("points", "hit", "beam_time"):
+        column = getattr(recording, name)
+        if column is not None:
+            builder = ArrayBuilder(column.dtype, column.shape[1:], workplace(job.output))
+            for block in arrays.iter_blocks(column, blank):
+                builder.append(column[block][~blank[block]])
+            kept[name] = builder.finish()
+    return replace(recording, **kept)
 
 
 def find_ending(source: Path | None, to: str | None) -> str:
@@ -216,11 +198,10 @@ def find_ending(source: Path | None, to: str | None) -> str:
     """
     own = ""
     if source is not None and not _is_folder(source):
-        form, name = detect_format(source).name, source.name
-        lengths = [len(end) for end in _endings(form) if name.lower().endswith(end)]
-        if form in _OWN:
-            own = name[len(name) - max(lengths) :] if lengths else source.suffix
+        form, name = detect_format(source), source.name.lower()
+        known = [end for end in form.endings if name.endswith(end)]
+        own = max(known, key=len, default=source.suffix) if form.name in _OWN else ""
     if to is None:
         return own
     endings = writers.find_writer(Path(), to).endings
-    return own if own.lower() in endings else next(iter(endings), "")
+    return own if own in endings else next(iter(endings), "")

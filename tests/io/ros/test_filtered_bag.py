@@ -11,7 +11,7 @@ from small_bags import FLOAT, UINT16, UINT32, cloud_message, write_bag
 
 from stillmap.io import read
 from stillmap.io.filtered_clouds import FilterJob, Omissions
-from stillmap.io.ros.bag import open_bag
+from stillmap.io.ros.bag import Bag
 from stillmap.io.ros.filtered import write_filtered
 from stillmap.io.ros.messages import load_typestore
 from stillmap.io.ros.writer import _TRANSIENT_LOCAL
@@ -255,7 +255,7 @@ def test_publishers_and_quality_of_service_stay(tmp_path, kind, messages):
     recording = read(source)
     out = tmp_path / f"out{source.suffix}"
     filtered(source, out, recording, recording.hit)
-    bag = open_bag([out], None, trusted=True)
+    bag = Bag([out], None, trusted=True)
     assert [(c.publisher, c.qos) for c in bag.channels] == [
         ("/lidar", ()) if kind == "bag" else ("", (qos,))
     ]

@@ -11,7 +11,7 @@ from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.io import writers
 from stillmap.io.builder import ReadContext
-from stillmap.io.ros.bag import open_bag
+from stillmap.io.ros.bag import Bag
 from stillmap.io.ros.reader import read as read_bags
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import interpret
@@ -119,7 +119,7 @@ def test_points_follow_the_joint(rig, path):
 
 def test_a_bag_in_parts(path, tmp_path):
     messages = Messages("cdr")
-    with closing(open_bag([path], None, trusted=True)) as whole:
+    with closing(Bag([path], None, trusted=True)) as whole:
         content = [
             (message.channel.topic, message.log_ns, (message.channel.type, message.raw))
             for message in whole.messages({channel.topic for channel in whole.channels})

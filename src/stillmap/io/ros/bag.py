@@ -1,10 +1,11 @@
 """Opens bags of every kind, detected by their first bytes; rosbags reads those with an index."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import yaml
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, Qos, QosDurability
@@ -20,14 +21,15 @@ from stillmap.io.ros.messages import (
     BAG1_MAGIC,
     DB3_MAGIC,
     MCAP_MAGIC,
-    Bag,
     Channel,
     DamagedBagError,
     Message,
     is_compressed,
     storage_files,
 )
-from stillmap.io.ros.recovery import DamagedBag, is_log_time
+from stillmap.io.ros.recovery import DamagedFile, Record, is_log_time
+
+T = TypeVar("T")
 
 _MAX_METADATA = 256 << 10  # bytes of YAML, which take two seconds to parse
 _MAX_QOS_TEXT = 16 << 10  # bytes of YAML: a megabyte takes rosbags half a minute
@@ -90,17 +92,17 @@ _STORAGES: dict[bytes, tuple[str, Callable[[Path], Any]]] = {  # by first bytes:
 }
 
 
-class IndexedBag:
-    """See `Bag`; any error of rosbags means damage."""
+class _IndexedFile:
+    """See `_File`; any error of rosbags means damage."""
 
     def __init__(self, kind: str, reader: Any) -> None:
         self.kind, self._reader, self.damage = kind, reader, SkippedRecords()
-        self.channels = [_channel(connection) for connection in reader.connections]
+        self.channels = {c.id: _channel(c) for c in reader.connections}
+        self.close = reader.close
 
-    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
-        """See `Bag`."""
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        channels = {c.id: c for c in self.channels}
+    def records(self, wanted: Collection[int], since_ns: int | None) -> Iterator[Record]:
+        """See `_File`."""
+        connections = [c for c in self._reader.connections if c.id in wanted]
         source = self._reader.messages(connections, start=since_ns) if connections else iter(())
         while True:
             try:
@@ -113,11 +115,7 @@ class IndexedBag:
                 raise DamagedBagError(str(error) or type(error).__name__) from error
             if not (is_log_time(log_ns) and isinstance(raw, bytes)):
                 raise DamagedBagError("a message without time or content")
-            yield Message(channels[connection.id], log_ns, raw)
-
-    def close(self) -> None:
-        """See `Bag`."""
-        self._reader.close()
+            yield connection.id, log_ns, raw
 
 
 def _channel(connection: Any) -> Channel:
@@ -137,60 +135,31 @@ def _channel(connection: Any) -> Channel:
     return channel
 
 
-class JoinedBag:
-    """Several bags, in order of time, as one; equal channels become one."""
+class _File(Protocol):
+    """A file of a bag.
 
-    def __init__(self, bags: list[Bag], kind: str) -> None:
-        self._bags, self.kind = bags, kind
-        self.damage = SkippedRecords().merge(*(bag.damage for bag in bags))
-        self._channels: dict[tuple[str, str, str, str], Channel] = {}
-        for bag in bags:
-            for channel in bag.channels:
-                new = channel._replace(id=len(self._channels), n_messages=0)
-                first = self._channels.setdefault(_identity(channel), new)
-                count = first.n_messages + channel.n_messages
-                self._channels[_identity(channel)] = first._replace(n_messages=count)
-        self.channels = list(self._channels.values())
+    Attributes:
+        kind: readable name.
+        channels: by their number in the file.
+        damage: unreadable parts by reason and byte position.
+    """
 
-    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
-        """See `Bag`."""
-        for bag in self._bags:
-            for message in bag.messages(topics, since_ns):
-                yield message._replace(channel=self._channels[_identity(message.channel)])
+    kind: str
+    channels: dict[int, Channel]
+    damage: SkippedRecords
 
-    def close(self) -> None:
-        """See `Bag`."""
-        for bag in self._bags:
-            bag.close()
+    def records(self, wanted: Collection[int], since_ns: int | None) -> Iterator[Record]:
+        """The messages of these channels, from a log time on."""
+        ...
 
 
-def _identity(channel: Channel) -> tuple[str, str, str, str]:
-    return channel.topic, channel.type, channel.encoding, channel.digest
+class Bag:
+    """A bag, or the parts of one run in order of time, as one; equal channels become one.
 
-
-class _CompressedBag:
-    """A file compressed as a whole, decompressed into a folder that lives until `close`."""
-
-    def __init__(self, path: Path, scratch: Path | None, trusted: bool) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix=".stillmap-", dir=scratch)
-        try:
-            file = Path(self._folder.name) / path.name.removesuffix(".zstd")
-            is_whole = limits.decompress_file(path, file)
-            self._bag = _open_file(file, scratch, trusted and is_whole)
-        except BaseException:
-            self._folder.cleanup()
-            raise
-        self.kind = f"{self._bag.kind}, compressed"
-        self.channels, self.damage = self._bag.channels, self._bag.damage
-        self.messages = self._bag.messages
-
-    def close(self) -> None:
-        self._bag.close()
-        self._folder.cleanup()
-
-
-def open_bag(paths: Sequence[Path], scratch: Path | None, *, trusted: bool) -> Bag:
-    """Open a bag, or the parts of one run as one bag.
+    Attributes:
+        kind: readable name.
+        channels: all channels.
+        damage: unreadable parts by reason and byte position.
 
     Args:
         paths: files or folders of files, in order of time.
@@ -201,40 +170,96 @@ def open_bag(paths: Sequence[Path], scratch: Path | None, *, trusted: bool) -> B
         DamagedBagError: `trusted`, and a bag is damaged or has no index.
         InputError: no readable bag.
     """
-    bags: list[Bag] = []
-    try:
-        for file in _list_all_files(paths):
-            bags.append(_open_file(file, scratch, trusted))
-    except BaseException:
-        for bag in bags:
-            bag.close()
-        raise
-    if len(paths) == 1 and not paths[0].is_dir():
-        return bags[0]
-    kinds = ", ".join(dict.fromkeys(bag.kind for bag in bags))
-    return JoinedBag(bags, f"ROS 2 folder ({kinds})" if paths[0].is_dir() else kinds)
+
+    def __init__(self, paths: Sequence[Path], scratch: Path | None, *, trusted: bool) -> None:
+        self._open = partial(Bag, paths, scratch, trusted=trusted)
+        with ExitStack() as stack:
+            files = _list_all_files(paths)
+            self._files = [_open_file(file, scratch, trusted, stack) for file in files]
+            self.close = stack.pop_all().close
+        kinds = ", ".join(dict.fromkeys(file.kind for file in self._files))
+        self.kind = f"ROS 2 folder ({kinds})" if paths[0].is_dir() else kinds
+        self.damage = SkippedRecords().merge(*(file.damage for file in self._files))
+        joined: dict[Channel, Channel] = {}
+        for channel in (c for file in self._files for c in file.channels.values()):
+            same = channel._replace(id=0, n_messages=0)
+            known = joined.get(same, same._replace(id=len(joined)))
+            joined[same] = known._replace(n_messages=known.n_messages + channel.n_messages)
+        self.channels = list(joined.values())
+        self._joined = [
+            {n: joined[c._replace(id=0, n_messages=0)] for n, c in file.channels.items()}
+            for file in self._files
+        ]
+
+    def reopen(self) -> "Bag":
+        """Open the same files again."""
+        return self._open()
+
+    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
+        """Messages of these topics, roughly by log time; with `since_ns` no earlier ones.
+
+        Raises:
+            DamagedBagError: an indexed bag is damaged.
+        """
+        for file, joined in zip(self._files, self._joined, strict=True):
+            channels = {number: c for number, c in joined.items() if c.topic in topics}
+            if channels:
+                for number, log_ns, raw in file.records(channels.keys(), since_ns):
+                    yield Message(channels[number], log_ns, raw)
 
 
-def bag_size(paths: Sequence[Path]) -> int:
-    """Bytes of all files of bags."""
-    return sum(file.stat().st_size for file in _list_all_files(paths))
+def read_bag(
+    paths: Sequence[Path], scratch: Path | None, use: Callable[[Bag], T], more: Sequence[Path] = ()
+) -> tuple[T, str]:
+    """What `use` makes of a bag, with its index, else of what can be recovered; and its damage.
+
+    Args:
+        paths, scratch: see Bag.
+        use: may be called twice.
+        more: bags that `use` opens too.
+
+    Raises:
+        InputError: nothing can be read, or `use` says so.
+    """
+    damage, where, size = "", str(paths[0]), sum(f.stat().st_size for f in _list_all_files(paths))
+    size += sum(file.stat().st_size for file in _list_all_files(more))
+    for trusted in (True, False):
+        try:
+            with limits.limit_output(size), closing(Bag(paths, scratch, trusted=trusted)) as bag:
+                return use(bag), damage
+        except DamagedBagError as error:
+            damage = str(error).rstrip(".")
+        except InputError as error:
+            what = f"{error.what}; it is damaged: {damage}" if damage else error.what
+            raise InputError(what, where=error.where or where, hint=error.hint) from error
+    raise InputError(f"is damaged: {damage}", where=where)
 
 
-def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
+def _open_file(path: Path, scratch: Path | None, trusted: bool, stack: ExitStack) -> _File:
+    """Open a file until the `stack` is closed."""
     with InputFile(path) as file:
         start = file.read(32)
     if is_compressed(path, start):
-        return _CompressedBag(path, scratch, trusted)
+        folder = tempfile.TemporaryDirectory(prefix=".stillmap-", dir=scratch)
+        unpacked = Path(stack.enter_context(folder)) / path.name.removesuffix(".zstd")
+        is_whole = limits.decompress_file(path, unpacked)
+        part = _open_file(unpacked, scratch, trusted and is_whole, stack)
+        part.kind += ", compressed"
+        return part
     for magic, (kind, open_indexed) in _STORAGES.items():
         if start.startswith(magic):
             try:
-                return IndexedBag(kind, open_indexed(path)) if trusted else DamagedBag(kind, path)
+                if not trusted:
+                    return DamagedFile(kind, path)
+                indexed = _IndexedFile(kind, open_indexed(path))
             except InputError as error:
                 raise InputError(error.what, where=str(path), hint=error.hint) from error
             except PermissionError as error:
                 raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
             except Exception as error:  # any error of a library about damaged bytes
                 raise DamagedBagError(str(error) or type(error).__name__) from error
+            stack.callback(indexed.close)
+            return indexed
     if start.startswith(BAG1_MAGIC):
         version = start[8:13].decode("ascii", "replace").strip()
         hint = "`rosbag fix` or `rosbag reindex` of ROS 1 makes a V2.0 of it"

@@ -1,7 +1,6 @@
 """Filtered copies of bags: readings replaced by "no return", points removed, all else as it was."""
 
 import math
-from contextlib import closing
 from typing import Any, cast
 
 import numpy as np
@@ -10,16 +9,14 @@ from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
-from stillmap.io.ros.bag import bag_size, open_bag
+from stillmap.io.ros.bag import Bag, read_bag
 from stillmap.io.ros.clouds import find_layout
-from stillmap.io.ros.limits import count_output, limit_output
+from stillmap.io.ros.limits import count_output
 from stillmap.io.ros.messages import (
     MULTI_ECHO,
     POINT_CLOUD,
     SCAN_TYPES,
-    Bag,
     BagKind,
-    DamagedBagError,
     Message,
     decode,
     decompress,
@@ -41,17 +38,8 @@ def write_filtered(job: FilterJob) -> Omissions:
     Raises:
         InputError: the source is not the bag that was read, or the output cannot be written.
     """
-    for trusted in (True, False):
-        try:
-            scratch = workplace(job.output)
-            with (
-                limit_output(bag_size([job.source])),
-                closing(open_bag([job.source], scratch, trusted=trusted)) as bag,
-            ):
-                return _copy(bag, job)
-        except DamagedBagError:
-            continue
-    raise InputError("is damaged", where=str(job.source))
+    scratch = workplace(job.output)
+    return read_bag([job.source], scratch, lambda bag: _copy(bag, job))[0]
 
 
 def _copy(bag: Bag, job: FilterJob) -> Omissions:

@@ -16,10 +16,10 @@ from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io.cameras import to_array
+from stillmap.io.ros.bag import Bag
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
-    Bag,
     Message,
     decode,
     frame_name,

@@ -7,10 +7,9 @@ bag by its first bytes loads none of the libraries.
 import re
 import struct
 from collections import defaultdict
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
@@ -82,32 +81,6 @@ class Message(NamedTuple):
 
 
 SkippedByTopic = defaultdict[str, SkippedRecords]
-
-
-class Bag(Protocol):
-    """An open bag.
-
-    Attributes:
-        kind: readable name.
-        channels: all channels.
-        damage: unreadable parts by reason and byte position.
-    """
-
-    kind: str
-    channels: list[Channel]
-    damage: SkippedRecords
-
-    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
-        """Messages of these topics, roughly by log time; with `since_ns` no earlier ones.
-
-        Raises:
-            DamagedBagError: an indexed bag is damaged.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close the files."""
-        ...
 
 
 def is_bag(path: Path, start: bytes | None) -> bool:

@@ -1,21 +1,20 @@
 """Reads ROS bags as recordings, without ROS: selects topics, and collects their messages once."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing, suppress
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext, SkippedRecords
-from stillmap.io.ros.bag import bag_size, open_bag
+from stillmap.io.ros.bag import Bag, read_bag
 from stillmap.io.ros.clouds import CloudCollector, read_clouds
 from stillmap.io.ros.image import ImageCollector
 from stillmap.io.ros.lasers import LaserCollector, read_lasers
-from stillmap.io.ros.limits import count_output, limit_output
+from stillmap.io.ros.limits import count_output
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -26,7 +25,6 @@ from stillmap.io.ros.messages import (
     SCAN_TYPES,
     TF,
     UNREADABLE,
-    Bag,
     Channel,
     DamagedBagError,
     Message,
@@ -67,48 +65,39 @@ def read(
     Raises:
         InputError: one cannot be read, or they hold no usable scan.
     """
-    where, damage, size = str(paths[0]), "", bag_size([*paths, *others])
-    for trusted in (True, False):
-        reopen = partial(open_bag, paths, context.scratch, trusted=trusted)
-        try:
-            with limit_output(size), closing(reopen()) as bag:
-                recording = _read_bag(bag, context, reopen, others, tilting)
-        except DamagedBagError as error:
-            damage = str(error).rstrip(".")
-        except InputError as error:
-            what = f"{error.what}; it is damaged: {damage}" if damage else error.what
-            raise InputError(what, where=error.where or where, hint=error.hint) from error
-        else:
-            source = recording.source
-            source.path, source.format = where, bag.kind
-            if damage:
-                what = f"the bag is cut or damaged ({damage}): what could be read is used"
-                todo = "copy it again; if it was recorded so, the map ends where the bag does"
-                source.warnings.insert(0, advise(what, todo))
-            return recording
-    raise InputError(f"is damaged: {damage}", where=where)
+
+    def use(bag: Bag) -> Recording | RawLasers:
+        return _read_content(bag, context, others, tilting)
+
+    recording, damage = read_bag(paths, context.scratch, use, others)
+    source, source.path = recording.source, str(paths[0])
+    if damage:
+        what = f"the bag is cut or damaged ({damage}): what could be read is used"
+        todo = "copy it again; if it was recorded so, the map ends where the bag does"
+        source.warnings.insert(0, advise(what, todo))
+    return recording
 
 
-def _read_bag(
-    bag: Bag, context: ReadContext, reopen: Callable[[], Bag], others: Sequence[Path], tilting: bool
+def _read_content(
+    bag: Bag, context: ReadContext, others: Sequence[Path], tilting: bool
 ) -> Recording | RawLasers:
-    topics = select_topics(bag, context.options)
-    content = collect_messages(bag, topics.uses, context)
+    uses, notes = select_topics(bag, context.options)
+    content = collect_messages(bag, uses, context)
     tree, window = content.transforms, content.window
     if others and not _static_topics(bag):
         _lend_transforms(tree, others, context.scratch)
     frames = Frames(tree, [own for own in content.odometry.values() if len(own.stamp_ns)])
     recording: Recording | RawLasers
-    if topics.has_clouds:
+    if any(c.type == POINT_CLOUD and uses.get(c.topic) == "scans" for c in bag.channels):
 
         def find_images(base: str) -> Images | None:
-            return window.select_images(content.images.build_images(tree, base, reopen))
+            return window.select_images(content.images.build_images(tree, base, bag.reopen))
 
         recording = read_clouds(content.clouds, frames, context.options, find_images)
     else:
         recording = read_lasers(content.lasers, frames, context, tilting=tilting)
     source, of_odometry = recording.source, [own.skipped for own in content.odometry.values()]
-    source.topics, source.skipped_unit = topics.notes, "message"
+    source.format, source.topics, source.skipped_unit = bag.kind, notes, "message"
     source.damage, source.part = bag.damage.by_reason(), window.part
     source.skipped_odometry = content.unreadable.merge(tree.skipped, *of_odometry).by_reason()
     return recording
@@ -122,7 +111,7 @@ def _lend_transforms(tree: TransformTree, others: Sequence[Path], scratch: Path 
     """Add the static transforms of the first of several bags that has any."""
     for path in others:
         try:
-            with closing(open_bag([path], scratch, trusted=True)) as bag:
+            with closing(Bag([path], scratch, trusted=True)) as bag:
                 for message in bag.messages(_static_topics(bag)):
                     with suppress(Exception):  # any error of rosbags about damaged bytes
                         tree.add_message(decode(message), static=True)
@@ -132,22 +121,12 @@ def _lend_transforms(tree: TransformTree, others: Sequence[Path], scratch: Path 
             continue  # it is reported when it is read itself
 
 
-class TopicSelection(NamedTuple):
-    """Topics by their use.
-
-    Attributes:
-        uses: "scans", "images", "transforms" or "odometry", by topic.
-        has_clouds: whether scans are point clouds.
-        notes: type, number of messages and use of every topic of the bag.
-    """
-
-    uses: dict[str, str]
-    has_clouds: bool
-    notes: list[dict[str, Any]]
-
-
-def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
+def select_topics(bag: Bag, options: ReadOptions) -> tuple[dict[str, str], list[dict[str, Any]]]:
     """Select the topics to read: laser scans, else point clouds, and what belongs to them.
+
+    Returns:
+        The use of each topic ("scans", "images", "transforms" or "odometry"), and the type, number
+        of messages and use of every topic of the bag.
 
     Raises:
         InputError: no topic has scans, or a topic that the options name has none.
@@ -182,7 +161,7 @@ def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
             why = "not for the map: its laser tilts"
         note = {"topic": c.topic, "type": c.type, "messages": c.n_messages}
         notes.append({**note, "used": use is not None, "why": why})
-    return TopicSelection(uses, not lasers, notes)
+    return uses, notes
 
 
 def _find_named(bag: Bag, faults: dict[int, str], options: ReadOptions) -> list[Channel]:
@@ -209,7 +188,7 @@ def _list_topics(channels: list[Channel]) -> str:
 
 
 class BagContent:
-    """The content of the selected topics, whose `uses` are as in `TopicSelection`."""
+    """The content of the selected topics, whose `uses` are as in `select_topics`."""
 
     def __init__(self, uses: dict[str, str], context: ReadContext) -> None:
         self._uses, self._count = uses, Counter[str]()  # scans by topic

@@ -8,9 +8,8 @@ import os
 import sqlite3
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import IO
@@ -22,7 +21,7 @@ from stillmap.core.input_files import InputFile, ShorterFileError
 from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits
-from stillmap.io.ros.messages import Channel, Message
+from stillmap.io.ros.messages import Channel
 
 CUT = "end that is no record"
 BAD_CHUNK = "chunk that cannot be decompressed"
@@ -31,95 +30,126 @@ BAD_ROWS = "rows that cannot be read"
 _MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK = 0x03, 0x04, 0x05, 0x06
 _MCAP_MAGIC_BYTE = 0x89
 
-_Records = Iterator[tuple[int, int, bytes]]  # channel id, log time in ns, content
-# records of a file, or of a decompressed chunk, which holds no further chunks
-_Scan = Callable[["DamagedBag", IO[bytes], bool], _Records]
+Record = tuple[int, int, bytes]  # number of the channel, log time in ns, content
 
 
 class _CutError(Exception):
     """The records end before the file does."""
 
 
-class DamagedBag:
-    """See `Bag`."""
+class DamagedFile:
+    """A file of a bag: all that can be read of it.
+
+    Attributes:
+        kind: readable name.
+        channels: by their number in the file.
+        damage: unreadable parts by reason and byte position.
+    """
 
     def __init__(self, kind: str, path: Path) -> None:
         self.kind, self._path, self.damage = kind, path, SkippedRecords()
-        self._channels: dict[int, Channel] = {}
+        self._is_bag1 = kind.startswith("ROS 1")
+        self.channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {}
-        count = Counter(channel for channel, _, _ in self._records())
-        self.channels = [c._replace(n_messages=count[c.id]) for c in self._channels.values()]
+        count = Counter(channel for channel, _, _ in self._all_records())
+        self.channels = {n: c._replace(n_messages=count[n]) for n, c in self.channels.items()}
 
-    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
-        """See `Bag`."""
-        wanted = {c.id: c for c in self.channels if c.topic in topics}
-        damage, self.damage = self.damage, SkippedRecords()
-        for channel, log_ns, raw in self._records() if wanted else ():
-            if channel in wanted and (since_ns is None or log_ns >= since_ns):
-                yield Message(wanted[channel], log_ns, raw)
-        self.damage = damage
+    def records(self, wanted: Collection[int], since_ns: int | None) -> Iterator[Record]:
+        """The messages of these channels, from a log time on."""
+        for record in self._all_records():
+            if record[0] in wanted and (since_ns is None or record[1] >= since_ns):
+                yield record
 
-    def close(self) -> None:
-        """See `Bag`."""
-
-    def _records(self) -> _Records:
+    def _all_records(self) -> Iterator[Record]:
         if self.kind.startswith("SQLite"):
             yield from self._rows()
             return
         with InputFile(self._path) as file:
-            is_bag1 = self.kind.startswith("ROS 1")
-            file.seek(len(b"#ROSBAG V2.0\n") if is_bag1 else 8)
-            yield from self._until_cut(file, _scan_bag1 if is_bag1 else _scan_mcap)
+            file.seek(len(b"#ROSBAG V2.0\n") if self._is_bag1 else 8)
+            yield from self._until_cut(file)
 
-    def _until_cut(self, file: IO[bytes], scan: _Scan, chunk_at: int | None = None) -> _Records:
-        """Records up to the first invalid one."""
+    def _until_cut(self, file: IO[bytes], chunk_at: int | None = None) -> Iterator[Record]:
+        """Records of a file, or of a decompressed chunk, up to the first invalid one."""
         try:
-            yield from scan(self, file, chunk_at is not None)
+            yield from self._scan(file, chunk_at is not None)
         except (limits.OutputLimitError, ShorterFileError):
             raise
         except Exception:  # any error of a library about damaged bytes
             self.damage.add(CUT, file.tell() if chunk_at is None else chunk_at)
 
-    def chunk(self, unpack: Callable[[], tuple[str, bytes]], scan: _Scan, at: int) -> _Records:
-        """Records of a chunk at a position; the beginning of a cut one can be decompressed.
+    def _scan(self, file: IO[bytes], in_chunk: bool) -> Iterator[Record]:
+        at, end = file.tell(), file.seek(0, os.SEEK_END)
+        file.seek(at)
+        while (at := file.tell()) < end:
+            limits.count_output(limits.RECORD_COST)
+            header = Header.read(file) if self._is_bag1 else Header()  # type: ignore[arg-type]
+            kind = header.get_uint8("op") if self._is_bag1 else _read_number(file, 1)
+            if not self._is_bag1 and kind == _MCAP_MAGIC_BYTE:  # of the footer
+                return
+            size = _read_number(file, 4 if self._is_bag1 else 8)
+            data = file.read(min(size, end - file.tell()))
+            is_chunk = kind == (RecordType.CHUNK if self._is_bag1 else _MCAP_CHUNK)
+            if is_chunk and not in_chunk:
+                yield from self._chunk(header, data, at)
+            elif is_chunk or kind == 0 or len(data) < size:
+                raise _CutError
+            elif self._is_bag1:
+                yield from self._read_bag1(kind, header, data)
+            else:
+                yield from self._read_mcap(kind, data)
 
-        `unpack` gives its compression and content.
-        """
+    def _chunk(self, header: Header, data: bytes, at: int) -> Iterator[Record]:
+        """Records of a chunk at a position; the beginning of a cut one can be decompressed."""
         try:
-            compression, data = unpack()
+            if self._is_bag1:
+                compression = header.get_string("compression")
+            else:
+                record = BytesIO(data[28:])
+                compression = _read_text(record)
+                data = record.read(min(_read_number(record, 8), len(data)))
             raw = data if compression in ("", "none") else limits.decompress(compression, data)
         except limits.OutputLimitError:
             raise
         except Exception:  # any error of a library about damaged bytes
             self.damage.add(BAD_CHUNK, at)
         else:
-            yield from self._until_cut(BytesIO(raw), scan, at)
+            yield from self._until_cut(BytesIO(raw), at)
 
-    def add(self, channel: Channel) -> None:
-        self._channels.setdefault(channel.id, channel)
+    def _read_bag1(self, kind: int, header: Header, data: bytes) -> Iterator[Record]:
+        if kind == RecordType.CONNECTION:
+            fields = Header.read(BytesIO(struct.pack("<I", len(data)) + data))
+            topic, name = normalize(header.get_string("topic")), fields.get_string("type")
+            number, digest = header.get_uint32("conn"), fields.get_string("md5sum")
+            channel = Channel(number, topic, normalize_msgtype(name), "ros1", digest=digest)
+            self.channels.setdefault(number, channel)
+        elif kind == RecordType.MSGDATA:
+            yield header.get_uint32("conn"), header.get_time("time"), data
 
-    def add_mcap(self, kind: int, record: IO[bytes]) -> None:
-        """Add a schema or channel of an MCAP file."""
-        number = _read_number(record, 2)
+    def _read_mcap(self, kind: int, data: bytes) -> Iterator[Record]:
+        record = BytesIO(data)
         if kind == _MCAP_SCHEMA:
+            number = _read_number(record, 2)
             self._schemas[number] = _read_text(record)
-            return
-        name = self._schemas.get(_read_number(record, 2), "")
-        topic, encoding = _read_text(record), _read_text(record)
-        self.add(Channel(number, topic, name, encoding))
+        elif kind == _MCAP_CHANNEL:
+            number, name = _read_number(record, 2), self._schemas.get(_read_number(record, 2), "")
+            topic, encoding = _read_text(record), _read_text(record)
+            self.channels.setdefault(number, Channel(number, topic, name, encoding))
+        elif kind == _MCAP_MESSAGE:
+            number, _, log_ns, _ = struct.unpack_from("<HIQQ", data)
+            yield number, min(log_ns, MAX_STAMP_NS), data[22:]
 
-    def _rows(self) -> _Records:
+    def _rows(self) -> Iterator[Record]:
         rows = 0
         try:
             with closing(limits.open_database(self._path)) as database:
                 topics = "SELECT id, name, type, serialization_format FROM topics"
                 for number, *words in database.execute(topics):
                     if all(isinstance(word, str) for word in words):
-                        self.add(Channel(number, *words))
+                        self.channels.setdefault(number, Channel(number, *words))
                 messages = "SELECT topic_id, timestamp, data FROM messages"
                 for number, log_ns, raw in database.execute(messages):
                     rows += 1
-                    if isinstance(raw, bytes) and is_log_time(log_ns) and number in self._channels:
+                    if isinstance(raw, bytes) and is_log_time(log_ns) and number in self.channels:
                         yield number, log_ns, raw
         except sqlite3.Error:
             self.damage.add(BAD_ROWS, rows + 1)
@@ -128,64 +158,6 @@ class DamagedBag:
 def is_log_time(value: object) -> bool:
     """True for log times in ns: columns of SQLite are not typed."""
     return isinstance(value, int) and abs(value) <= MAX_STAMP_NS
-
-
-def _scan_bag1(bag: DamagedBag, file: IO[bytes], in_chunk: bool) -> _Records:
-    end = _size(file)
-    while (at := file.tell()) < end:
-        limits.count_output(limits.RECORD_COST)
-        header = Header.read(file)  # type: ignore[arg-type]
-        kind, size = header.get_uint8("op"), _read_number(file, 4)
-        data = file.read(min(size, end - file.tell()))
-        if kind == RecordType.CHUNK and not in_chunk:
-            yield from bag.chunk(partial(_unpack_bag1, header, data), _scan_bag1, at)
-        elif kind == RecordType.CHUNK or len(data) < size:
-            raise _CutError
-        elif kind == RecordType.CONNECTION:
-            fields = Header.read(BytesIO(struct.pack("<I", size) + data))
-            topic, name = normalize(header.get_string("topic")), fields.get_string("type")
-            number, digest = header.get_uint32("conn"), fields.get_string("md5sum")
-            bag.add(Channel(number, topic, normalize_msgtype(name), "ros1", digest=digest))
-        elif kind == RecordType.MSGDATA:
-            yield header.get_uint32("conn"), header.get_time("time"), data
-
-
-def _scan_mcap(bag: DamagedBag, file: IO[bytes], in_chunk: bool) -> _Records:
-    end = _size(file)
-    while (at := file.tell()) < end:
-        limits.count_output(limits.RECORD_COST)
-        kind = _read_number(file, 1)
-        if kind == _MCAP_MAGIC_BYTE:  # of the footer
-            return
-        size = _read_number(file, 8)
-        data = file.read(min(size, end - file.tell()))
-        record = BytesIO(data)
-        if kind == _MCAP_CHUNK and not in_chunk:
-            yield from bag.chunk(partial(_unpack_mcap, record), _scan_mcap, at)
-        elif kind in (0, _MCAP_CHUNK) or len(data) < size:
-            raise _CutError
-        elif kind in (_MCAP_SCHEMA, _MCAP_CHANNEL):
-            bag.add_mcap(kind, record)
-        elif kind == _MCAP_MESSAGE:
-            number, _, log_ns, _ = struct.unpack_from("<HIQQ", data)
-            yield number, min(log_ns, MAX_STAMP_NS), data[22:]
-
-
-def _unpack_bag1(header: Header, data: bytes) -> tuple[str, bytes]:
-    return header.get_string("compression"), data
-
-
-def _unpack_mcap(record: BytesIO) -> tuple[str, bytes]:
-    record.seek(28)
-    compression = _read_text(record)
-    return compression, record.read(min(_read_number(record, 8), len(record.getvalue())))
-
-
-def _size(file: IO[bytes]) -> int:
-    at = file.tell()
-    end = file.seek(0, os.SEEK_END)
-    file.seek(at)
-    return end
 
 
 def _read_number(file: IO[bytes], size: int) -> int:
