@@ -58,9 +58,9 @@ def test_picture_shows_what_stands_and_what_changed(pictures, session, chair, bo
 
 @pytest.mark.parametrize("session", range(4))
 def test_differences_over_the_map_make_the_picture(pictures, session):
-    patch = pictures.draw_difference(session)
+    left, top, patch = pictures.draw_difference(session)
     whole = pictures.draw_map().convert("RGBA")
-    whole.alpha_composite(patch.image.convert("RGBA"), (patch.left, patch.top))
+    whole.alpha_composite(patch.convert("RGBA"), (left, top))
     assert whole.convert("RGB").tobytes() == pictures.draw(session).convert("RGB").tobytes()
 
 

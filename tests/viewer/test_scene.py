@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from made_up_models import glb_of
 
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
+from stillmap.results.gltf import read_glb
 from stillmap.results.viewer.nodes import default_view
 from stillmap.results.viewer.scene import read_scene
 
@@ -95,7 +97,8 @@ def test_default_view_shows_the_whole_scene(result_of):
     flat, space = read_scene(result_of(2)), read_scene(result_of(3))
     above = default_view(flat)
     x0, y0, x1, y1 = flat.map_image.window
-    assert above.look_at == pytest.approx([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
+    center = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
+    assert above.look_at + flat.origin == pytest.approx(center)
     assert above.height >= y1 - y0
     down = (above.look_at - above.position) / np.linalg.norm(above.look_at - above.position)
     assert down[2] < -0.999
@@ -109,3 +112,14 @@ def test_sample_contains_every_lidar_ring():
     """At even steps 16 rings that come in turn would show one of them."""
     rings = np.bincount(sample_indices(160_000, 10_000) % 16, minlength=16)
     assert rings.min() > 400
+
+
+def test_a_model_is_read_unchanged_and_a_damaged_or_large_one_refused(tmp_path, glb):
+    path = tmp_path / "a.glb"
+    path.write_bytes(glb)
+    assert read_glb(path, len(glb)) == glb
+    for data in (b"", glb_of({}, version=1), glb_of({}) + b"more", glb[:-1], glb + glb):
+        path.write_bytes(data)
+        with pytest.raises(InputError) as caught:
+            read_glb(path, len(glb))
+        assert caught.value.where == str(path)

@@ -105,32 +105,34 @@ def select_views(candidates: Candidates, pairs: Int32, seam_cost: float) -> Int3
     with np.errstate(invalid="ignore"):
         cost = np.where(np.isfinite(candidates.utility), best - candidates.utility, np.inf)
     pairs = pairs[has_view[pairs].all(axis=1)]
-    a, b = pairs.T
-    sent = candidates.view[a]
-    equal = (sent[:, :, None] == candidates.view[b][:, None]) & (sent != NONE)[:, :, None]
-    ways = ((a, b, equal), (b, a, equal.transpose(0, 2, 1)))
-    messages = np.zeros((2, len(pairs), K), np.float32)  # to the second face, and to the first
+    # to the second face of a pair, and to the first
+    ways = (pairs.T, pairs.T[::-1])
+    messages = np.zeros((2, len(pairs), K), np.float32)
     belief = cost
     for _ in range(_ITERATIONS):
-        new = [
-            _messages(belief[sender], messages[1 - way], same, seam_cost)
-            for way, (sender, _, same) in enumerate(ways)
-        ]
-        messages = _DAMPING * messages + (1.0 - _DAMPING) * np.stack(new)
+        new = np.empty_like(messages)
+        for way, (sender, receiver) in enumerate(ways):
+            own = belief[sender] - np.where(np.isfinite(belief[sender]), messages[1 - way], 0.0)
+            views = candidates.view[sender], candidates.view[receiver]
+            new[way] = _least_costs(own, *views, seam_cost)
+        messages = _DAMPING * messages + (1.0 - _DAMPING) * new
         belief = cost.copy()
-        for way, (_, receiver, _) in enumerate(ways):
+        for way, (_, receiver) in enumerate(ways):
             np.add.at(belief, receiver, messages[way])
     label = np.argmin(belief, axis=1)
     return np.where(has_view, candidates.view[np.arange(F), label], NONE).astype(np.int32)
 
 
-def _messages(belief: Float32, received: Float32, same: Bool, seam_cost: float) -> Float32:
-    """(n, K) least costs of n senders for each view of their receivers, by the beliefs (n, K) of
-    the senders without what they received; `same` (n, K, K): a sender's and a receiver's view."""
-    own = belief - np.where(np.isfinite(belief), received, 0.0)
-    lowest = own.min(axis=1, keepdims=True)
-    kept = np.where(same, own[:, :, None], np.inf).min(axis=1)
-    return np.asarray(np.minimum(kept, lowest + seam_cost) - lowest, np.float32)
+def _least_costs(own: Float32, sent: Int32, received: Int32, seam_cost: float) -> Float32:
+    """(n, K) least costs of n faces, whose views `sent` (n, K) cost `own` (n, K), for each view
+    `received` (n, K) of a face beside; relative to the least of all."""
+    lowest = own.min(axis=1)
+    least = np.repeat(lowest[:, None] + np.float32(seam_cost), own.shape[1], axis=1)
+    # view by view: all pairs of views at once would take K times the memory
+    for view, cost in zip(sent.T, own.T, strict=True):
+        same = (received == view[:, None]) & (view != NONE)[:, None]
+        np.minimum(least, cost[:, None], out=least, where=same)
+    return np.asarray(least - lowest[:, None], np.float32)
 
 
 def sample_face_colors(

@@ -6,7 +6,7 @@ therefore written as `intensity`, from 0 to 1, and there are no times.
 
 import hashlib
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
 from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE
-from stillmap.results.point_cloud import Block, Cloud
+from stillmap.results.point_cloud import Cloud
 
 _BLOCK = 1 << 16  # points written at a time
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -63,94 +63,81 @@ def write(
 def _write_scan(
     library: Any, file: Any, cloud: Cloud, progress: Callable[[float], None] | None
 ) -> None:
-    root = file.root()
-    file.extensionsAdd("", library.E57_V1_0_URI)
-    root.set("formatName", library.StringNode(file, "ASTM E57 3D Imaging Data File"))
-    root.set("versionMajor", library.IntegerNode(file, library.E57_FORMAT_MAJOR))
-    root.set("versionMinor", library.IntegerNode(file, library.E57_FORMAT_MINOR))
-    root.set("e57LibraryVersion", library.StringNode(file, library.E57_LIBRARY_ID))
-    root.set("coordinateMetadata", library.StringNode(file, ""))
-    scans = library.VectorNode(file, True)
-    root.set("data3D", scans)
-    root.set("images2D", library.VectorNode(file, True))
-    scan = library.StructureNode(file)
-    scans.append(scan)
-    scan.set("name", library.StringNode(file, "points in the map frame"))
-    text = "intensity is the probability that the point is static"
-    scan.set("description", library.StringNode(file, f"stillmap: {text}"))
-    shares = {"intensityMinimum": 0.0, "intensityMaximum": 1.0}
-    scan.set("intensityLimits", _float_nodes(library, file, shares))
+    columns = {
+        axis: library.ScaledIntegerNode(file, 0, -MAX_INTEGER, MAX_INTEGER, SCALE, float(center))
+        for axis, center in zip(_AXES, cloud.origin, strict=True)
+    }
+    columns["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
     if cloud.has_colors:
-        limits = library.StructureNode(file)
-        for name in _COLORS:
-            limits.set(f"{name}Minimum", library.IntegerNode(file, 0, 0, 255))
-            limits.set(f"{name}Maximum", library.IntegerNode(file, 255, 0, 255))
-        scan.set("colorLimits", limits)
-    if cloud.start_ns is not None and cloud.start_ns >= GPS_EPOCH_S * 10**9:
-        start = {"dateTimeValue": 1e-9 * cloud.start_ns - GPS_EPOCH_S}
-        scan.set("acquisitionStart", _float_nodes(library, file, start))
-    codecs, columns = library.VectorNode(file, True), _Columns(library, file, cloud)
-    points = library.CompressedVectorNode(file, columns.prototype, codecs)
-    scan.set("points", points)
-    with closing(points.writer(columns.buffers)) as writer:
+        columns |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLORS}
+    values, buffers = [np.zeros(_BLOCK) for _ in columns], library.VectorSourceDestBuffer()
+    for name, one in zip(columns, values, strict=True):
+        buffers.append(library.SourceDestBuffer(file, name, one, _BLOCK, True, True))
+    prototype = _fill(library, file, library.StructureNode(file), columns)
+    points = library.CompressedVectorNode(file, prototype, library.VectorNode(file, True))
+    root, scans, scan = file.root(), library.VectorNode(file, True), library.StructureNode(file)
+    file.extensionsAdd("", library.E57_V1_0_URI)
+    header = {
+        "formatName": "ASTM E57 3D Imaging Data File",
+        "versionMajor": library.E57_FORMAT_MAJOR,
+        "versionMinor": library.E57_FORMAT_MINOR,
+        "e57LibraryVersion": library.E57_LIBRARY_ID,
+        "coordinateMetadata": "",
+        "data3D": scans,
+        "images2D": library.VectorNode(file, True),
+    }
+    _fill(library, file, root, header)
+    scans.append(scan)
+    _fill(library, file, scan, {**_describe_scan(cloud), "points": points})
+    digest, low, high = hashlib.sha256(), np.full(3, np.inf), np.full(3, -np.inf)
+    with closing(points.writer(buffers)) as writer:
         for block in cloud.iter_blocks(progress):
-            for n in columns.fill(block):
-                writer.write(n)
-    scan.set("cartesianBounds", _float_nodes(library, file, columns.bounds()))
+            for part in block.split(_BLOCK):
+                if np.abs(part.points - cloud.origin).max() >= MAX_INTEGER * SCALE:
+                    what = "cannot be written: a point is beyond the range of E57 coordinates"
+                    raise InputError(what)
+                low = np.minimum(low, part.points.min(axis=0))
+                high = np.maximum(high, part.points.max(axis=0))
+                colors = () if part.colors is None else part.colors.T
+                for one, column in zip(
+                    values, [*part.points.T, part.p_static, *colors], strict=True
+                ):
+                    one[: len(column)] = column
+                    digest.update(one[: len(column)].data)
+                writer.write(len(part.points))
+    if cloud.count:
+        ends = {f"{axis}Minimum": at for axis, at in zip("xyz", low.tolist(), strict=True)}
+        ends |= {f"{axis}Maximum": at for axis, at in zip("xyz", high.tolist(), strict=True)}
+        _fill(library, file, scan, {"cartesianBounds": ends})
     # derived from the points, so that the file is reproducible
     for node, name in ((root, "file"), (scan, "scan")):
-        guid = uuid.uuid5(uuid.NAMESPACE_URL, f"{name} {columns.digest.hexdigest()}")
+        guid = uuid.uuid5(uuid.NAMESPACE_URL, f"{name} {digest.hexdigest()}")
         node.set("guid", library.StringNode(file, f"{{{guid}}}"))
 
 
-def _float_nodes(library: Any, file: Any, values: dict[str, float]) -> Any:
-    node = library.StructureNode(file)
+def _describe_scan(cloud: Cloud) -> dict[str, Any]:
+    """What a scan says of its points."""
+    text = "intensity is the probability that the point is static"
+    scan: dict[str, Any] = {
+        "name": "points in the map frame",
+        "description": f"stillmap: {text}",
+        "intensityLimits": {"intensityMinimum": 0.0, "intensityMaximum": 1.0},
+    }
+    if cloud.has_colors:
+        ends = (("Minimum", 0), ("Maximum", 255))
+        scan["colorLimits"] = {name + end: value for name in _COLORS for end, value in ends}
+    if cloud.start_ns is not None and cloud.start_ns >= GPS_EPOCH_S * 10**9:
+        scan["acquisitionStart"] = {"dateTimeValue": 1e-9 * cloud.start_ns - GPS_EPOCH_S}
+    return scan
+
+
+def _fill(library: Any, file: Any, node: Any, values: Mapping[str, Any]) -> Any:
+    """A structure with these values: texts, numbers, nodes, and mappings of such."""
+    kinds = {str: library.StringNode, int: library.IntegerNode, float: library.FloatNode}
     for name, value in values.items():
-        node.set(name, library.FloatNode(file, float(value)))
+        if isinstance(value, dict):
+            node.set(name, _fill(library, file, library.StructureNode(file), value))
+        else:
+            make = kinds.get(type(value))
+            node.set(name, value if make is None else make(file, value))
     return node
-
-
-class _Columns:
-    """The buffers from which libe57 writes the points."""
-
-    def __init__(self, library: Any, file: Any, cloud: Cloud) -> None:
-        self._origin = cloud.origin
-        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
-        self.digest = hashlib.sha256()
-        self.prototype = library.StructureNode(file)
-        nodes = {
-            name: library.ScaledIntegerNode(
-                file, 0, -MAX_INTEGER, MAX_INTEGER, SCALE, float(center)
-            )
-            for name, center in zip(_AXES, cloud.origin, strict=True)
-        }
-        nodes["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
-        if cloud.has_colors:
-            nodes |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLORS}
-        self._values = [np.zeros(_BLOCK) for _ in nodes]
-        self.buffers = library.VectorSourceDestBuffer()
-        for (name, node), values in zip(nodes.items(), self._values, strict=True):
-            self.prototype.set(name, node)
-            self.buffers.append(library.SourceDestBuffer(file, name, values, _BLOCK, True, True))
-
-    def fill(self, block: Block) -> Iterator[int]:
-        """Fill the buffers with the points, block by block; yields the number of points in them."""
-        for part in block.split(_BLOCK):
-            n, points = len(part.points), part.points
-            if np.abs(points - self._origin).max() >= MAX_INTEGER * SCALE:
-                what = "cannot be written: a point is beyond the range of E57 coordinates"
-                raise InputError(what)
-            self._low = np.minimum(self._low, points.min(axis=0))
-            self._high = np.maximum(self._high, points.max(axis=0))
-            columns = [*points.T, part.p_static, *(() if part.colors is None else part.colors.T)]
-            for buffer, column in zip(self._values, columns, strict=True):
-                buffer[:n] = column
-                self.digest.update(buffer[:n].data)
-            yield n
-
-    def bounds(self) -> dict[str, float]:
-        """`cartesianBounds` of the points so far."""
-        if not np.isfinite(self._low).all():
-            return {}
-        limits = {"Minimum": self._low, "Maximum": self._high}
-        return {f"{axis}{end}": at[k] for k, axis in enumerate("xyz") for end, at in limits.items()}

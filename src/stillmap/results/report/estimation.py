@@ -3,12 +3,11 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.report.figures import round_down
 from stillmap.slam.mount_calibration import Parameter
@@ -68,7 +67,6 @@ _CALIBRATED = {
     "rotation_gain": (1.0, "", 3, "rotation, as a factor"),
     "latency": (1.0, " s", 3, "delay"),
 }
-_MIN_DYNAMIC = 100  # dynamic returns below which the weights of dynamic classes mean little
 
 
 def convergence_data(result: MappingResult) -> dict[str, Any] | None:
@@ -96,28 +94,8 @@ def convergence_data(result: MappingResult) -> dict[str, Any] | None:
         ],
         # how many times as likely a beam is with the map as without
         "gain": math.exp(min(kept, 700.0)) if kept is not None and math.isfinite(kept) else None,
-        "loops": len(result.loops),
         "rejected": Counter(one.rejected for one in result.loops if one.rejected).most_common(),
         "curves": curves if len(iterations) > 1 else [],
-    }
-
-
-def fitted_data(result: MappingResult) -> dict[str, Any] | None:
-    """Parameters that the estimator fitted to the recording; None where it fits none."""
-    learned: Mapping[str, Any] = result.learned
-    if not learned:
-        return None
-    dynamic = count_beams(result.recording, result.p_static)["dynamic"]
-    return {
-        "p_static": float(learned["p_static"]),
-        "noise": float(learned["scatter"]),
-        "changing": learned.get("changing") if result.recording.dimension == 3 else None,
-        "dynamic": dynamic,
-        "few": dynamic < _MIN_DYNAMIC,
-        **{
-            name: sorted((float(row["value"]), float(row["share"])) for row in learned[name])
-            for name in ("static_occupied", "mover_seconds", "mover_occupied")
-        },
     }
 
 

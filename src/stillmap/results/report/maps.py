@@ -12,7 +12,7 @@ from stillmap.core.grid_map import GridMap
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
-from stillmap.pipeline.snapshots import Window, extent
+from stillmap.pipeline.snapshots import Snapshot, Window, extent
 from stillmap.results.map_server import CHANGED, changed_cells, trinary_pixels
 from stillmap.results.report.figures import (
     UNKNOWN_LEVEL,
@@ -28,7 +28,7 @@ from stillmap.results.report.figures import (
     reduce_levels,
     reduce_squares,
 )
-from stillmap.results.run_json import known_area, tilting_record
+from stillmap.results.run_json import known_area
 from stillmap.tracking import FlowMap
 from stillmap.tracking.objects import mean_speed, track_length
 
@@ -130,26 +130,14 @@ def draw_dynamic(result: "MappingResult | TiltingResult", view: MapView) -> str:
 
 
 def written_map_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
-    """A map, its picture as written placed in percent of a view, and the bounds of both in m."""
+    """A map, its picture as written, and the view of what lies over it."""
     written = draw_written_map(occupancy, mode)
-    (x0, y0, x1, y1), (left, bottom, right, top) = view.window, written.window
-    width, height = x1 - x0, y1 - y0
     return {
         "view": view,
         "meters": tuple(n * occupancy.resolution for n in occupancy.p_occupied.shape[::-1]),
         "cell": occupancy.resolution,
-        "written": {
-            "image": data_uri(written.picture, optimize=True),
-            "size": written.picture.size,
-            "factor": written.factor,
-            "place": {
-                "left": 100 * (left - x0) / width,
-                "bottom": 100 * (bottom - y0) / height,
-                "width": 100 * (right - left) / width,
-                "height": 100 * (top - bottom) / height,
-            },
-            "bounds": (min(x0, left), min(y0, bottom), max(x1, right), max(y1, top)),
-        },
+        "written": written,
+        "image": data_uri(written.picture, optimize=True),
     }
 
 
@@ -166,9 +154,7 @@ def changes_data(result: MappingResult, view: MapView) -> dict[str, Any] | None:
         "numbers": view.to_pixels(corners).tolist(),
         "colors": _COLORS,
         "counts": [(kind, counts[kind]) for kind in CHANGED if counts[kind]],
-        "total": len(result.changes),
         "listed": listed,
-        "start_ns": int(result.recording.stamp_ns[0]),
     }
 
 
@@ -233,21 +219,12 @@ def draw_traffic(traffic: FlowMap, picture: Image.Image, window: Window) -> Imag
     return Image.fromarray(image).quantize(_TRAFFIC_COLORS)
 
 
-def rig_data(tilting: "TiltingResult", view: MapView | None) -> dict[str, Any]:
-    """Counts of the second laser and its dynamic returns on the map of the first."""
-    dynamic = None if view is None else draw_dynamic(tilting, view)
-    return {"record": tilting_record(tilting), "dynamic": dynamic}
-
-
-def evolution_data(result: MappingResult) -> dict[str, Any] | None:
-    """The part of the map with most dynamic returns over the iterations (Fig. 8)."""
-    if not result.snapshots or not result.snapshots[0].p_occupied.size:
-        return None
-    first, pictures = result.snapshots[0], map(draw_snapshot, result.snapshots)
-    return {
-        "meters": [n * first.resolution for n in first.p_occupied.shape[::-1]],
-        "snapshots": [
-            (one, MapView(extent(one), picture.size), data_uri(picture))
-            for one, picture in zip(result.snapshots, pictures, strict=True)
-        ],
-    }
+def evolution_data(result: MappingResult) -> list[tuple[Snapshot, MapView, str]]:
+    """The part of the map with most dynamic returns over the iterations (Fig. 8): of each what was
+    seen, its view, and the `data:` URI of its picture."""
+    shown = [one for one in result.snapshots if one.p_occupied.size]
+    pictures = map(draw_snapshot, shown)
+    return [
+        (one, MapView(extent(one), picture.size), data_uri(picture))
+        for one, picture in zip(shown, pictures, strict=True)
+    ]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from stillmap.core.config import iter_options
 from stillmap.core.errors import split_advice
@@ -10,18 +10,18 @@ from stillmap.core.json import to_jsonable
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.report.estimation import calibration_data, convergence_data, fitted_data
+from stillmap.results.report.estimation import calibration_data, convergence_data
 from stillmap.results.report.maps import (
     changes_data,
+    draw_dynamic,
     draw_filtered_map,
     evolution_data,
     map_data,
     objects_data,
-    rig_data,
 )
 from stillmap.results.report.point_view import points_data
 from stillmap.results.report.template import render_page
-from stillmap.results.run_json import models_record
+from stillmap.results.run_json import models_record, tilting_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -60,60 +60,31 @@ def render_report(
         models: of the place and of moving objects.
         folder: the result folder, to whose files the page links; None: no links.
     """
-    figure = draw_filtered_map(result)
+    figure, recording = draw_filtered_map(result), result.recording
+    findings = [split_advice(text) for text in result.warnings]
     data = {
         "result": result,
-        "run": (run := _run_data(result)),
-        "title": run["name"],
-        "quality": [
-            (name, getattr(result.quality, name), line)
-            for name, line in describe_quality(result.quality).items()
-        ],
+        "title": Path(recording.source.path or "").name or "recording",
+        "source": to_jsonable(recording.source.to_dict()),
+        "beams": count_beams(recording, result.p_static),
+        "seconds": 1e-9 * float(recording.stamp_ns[-1] - recording.stamp_ns[0]),
+        "warnings": [(what, todo) for what, todo in findings if todo],
+        "notes": [what for what, todo in findings if not todo],
+        "quality": describe_quality(result.quality),
         "files": files_data(folder),
-        "maps": None if figure is None else map_data(result, *figure),
-        "changes": None if figure is None else changes_data(result, figure[0]),
-        "objects": None if figure is None else objects_data(result, *figure),
+        "maps": figure and map_data(result, *figure),
+        "changes": figure and changes_data(result, figure[0]),
+        "objects": figure and objects_data(result, *figure),
         "points": points_data(result, tilting),
-        "rig": None if tilting is None else rig_data(tilting, figure and figure[0]),
-        "models": None if models is None else _models_data(models),
-        "fitted": fitted_data(result),
+        "rig": None if tilting is None else tilting_record(tilting),
+        "rig_dynamic": figure and tilting and draw_dynamic(tilting, figure[0]),
+        "models": None if models is None else models_record(models),
         "calibration": calibration_data(result),
         "convergence": convergence_data(result),
         "evolution": evolution_data(result),
-        "source": _source_data(result),
-        "stages": _stages_data(result),
         "options": [(one.name, one.value) for one in iter_options(result.options)],
     }
     return render_page(data)
-
-
-def _models_data(models: "Models") -> dict[str, Any]:
-    """The record of the models, and why no image could texture anything; see `models_record`."""
-    record = models_record(models)
-    pictures = record["pictures"]
-    reasons = {**pictures["left_out"], "damaged": len(pictures["unread"])}
-    listed = "; ".join(f"{count:,}: {why}" for why, count in reasons.items() if count)
-    return {**record, "untextured_reason": "" if record["area_painted"] else listed}
-
-
-def _run_data(result: MappingResult) -> dict[str, Any]:
-    """Title, headline figures and warnings."""
-    source, stamps, stages = result.recording.source, result.recording.stamp_ns, result.stages
-    path = source.path or ""
-    findings = [split_advice(text) for text in result.warnings]
-    return {
-        "name": Path(path).name or "recording",
-        "path": path,
-        "format": source.format or "",
-        "beams": count_beams(result.recording, result.p_static),
-        "duration": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
-        "seconds": sum(float(stage.get("seconds") or 0) for stage in stages.values()),
-        "memory": max(
-            (stage.get("peak_memory_bytes") or 0 for stage in stages.values()), default=0
-        ),
-        "warnings": [(what, todo) for what, todo in findings if todo],
-        "notes": [what for what, todo in findings if not todo],
-    }
 
 
 def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[tuple[str, str]]:
@@ -127,29 +98,3 @@ def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[
         return []
     known = {**more, **_FILES, **more}
     return [(name, what) for name, what in known.items() if (folder / name).is_file()]
-
-
-def _stages_data(result: MappingResult) -> list[tuple[str, float, int]]:
-    """Name, seconds and peak memory in bytes of each stage."""
-    return [
-        (
-            name.replace("_", " "),
-            float(stage.get("seconds") or 0),
-            int(stage.get("peak_memory_bytes") or 0),
-        )
-        for name, stage in result.stages.items()
-    ]
-
-
-def _source_data(result: MappingResult) -> dict[str, Any]:
-    """The reader's notes on the recording, without empty entries."""
-    source = to_jsonable(result.recording.source.to_dict())
-    skipped = {name: source.pop(name, None) or {} for name in ("skipped", "skipped_odometry")}
-    source.pop("warnings", None)  # shown at the top
-    return {
-        "entries": {k: v for k, v in source.items() if v not in ({}, [], None)},
-        **{
-            name: sorted(reasons.items(), key=lambda item: -int(item[1]["count"]))
-            for name, reasons in skipped.items()
-        },
-    }

@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,35 +78,28 @@ def render_place_report(
         InputError: a file of the place is damaged.
     """
     timeline = read_timeline(folder, str(record["place"]["map_state"]))
-    pictures = PlacePictures(occupancy, timeline) if occupancy.p_occupied.size else None
+    numbers = range(len(timeline.sessions))
+    pictures = small = None
+    if occupancy.p_occupied.size:
+        pictures = PlacePictures(occupancy, timeline)
+        small = PlacePictures(occupancy, timeline, _THUMBNAIL_PIXELS)
     data = {
         "title": f"{len(timeline.sessions)} sessions of a place",
-        "place": _place_data(timeline, record),
-        "maps": _map_data(folder, timeline, occupancy, mode, pictures),
-        "sessions": [_session_data(timeline, k) for k in range(len(timeline.sessions))],
-        "refused": timeline.refused,
-        "thumbnails": _thumbnails_data(occupancy, timeline),
-        "steps": [_step_data(timeline, k, pictures) for k in range(1, len(timeline.sessions))],
+        "place": record,
+        "timeline": timeline,
+        "maps": pictures and _map_data(folder, timeline, occupancy, mode, pictures),
+        "thumbnails": [small and (small.view, data_uri(small.draw(k))) for k in numbers],
+        "steps": [_step_data(timeline, k, pictures) for k in numbers[1:]],
+        "max_rows": _MAX_ROWS,
         "kinds": [(kind, _WORDS[kind][0], KIND_COLORS[kind]) for kind in _KINDS],
         "files": files_data(folder, _FILES),
+        # functions of the templates
+        "count_kinds": _count_kinds,
+        "date_time": format_date_time,
+        "color_of": _session_color,
+        "heading": _heading,
     }
     return render_page(data)
-
-
-def _place_data(timeline: Timeline, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Headline figures."""
-    return {
-        "dimension": record["dimension"],
-        "first": format_date_time(min(one.first_ns for one in timeline.sessions)),
-        "last": format_date_time(max(one.last_ns for one in timeline.sessions)),
-        "kinds": _count_kinds(timeline.changes),
-        "changes": len(timeline.changes),
-        **{name: record["counts"][name] for name in ("scans", "hits", "dynamic")},
-        "constraints": record["place"]["constraints"],
-        "area": record["area"]["known"],
-        "geometry": record["quality"]["geometry"],
-        "map_state": timeline.map_state,
-    }
 
 
 def _count_kinds(changes: list[SessionChange]) -> list[tuple[str, int]]:
@@ -115,20 +108,27 @@ def _count_kinds(changes: list[SessionChange]) -> list[tuple[str, int]]:
     return [(_WORDS[kind][counts[kind] > 1], counts[kind]) for kind in _KINDS if counts[kind]]
 
 
+def _session_color(number: int) -> tuple[int, ...]:
+    return tuple(color_by_id([number])[0].tolist())
+
+
+def _heading(T: Float) -> float:
+    """In degrees; + 0.0 turns a negative zero into zero."""
+    return round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0
+
+
 def _map_data(
     folder: Path,
     timeline: Timeline,
     occupancy: GridMap,
     mode: MapMode,
-    pictures: "PlacePictures | None",
-) -> dict[str, Any] | None:
-    """The map as written with the trajectories; None for a map without cells."""
-    if pictures is None:
-        return None
+    pictures: "PlacePictures",
+) -> dict[str, Any]:
+    """The map as written with the trajectories."""
     view = pictures.view
     return {
         **written_map_data(occupancy, mode, view),
-        "image": data_uri(pictures.draw_map()),
+        "base": data_uri(pictures.draw_map()),
         "font_size": max(view.size) * _FONT_SHARE,
         "paths": [_path_data(folder, one, k, view) for k, one in enumerate(timeline.sessions)],
     }
@@ -145,79 +145,15 @@ def _path_data(folder: Path, one: PlaceSession, number: int, view: MapView) -> d
     }
 
 
-def _session_color(number: int) -> tuple[int, ...]:
-    return tuple(color_by_id([number])[0].tolist())
-
-
-def _session_data(timeline: Timeline, number: int) -> dict[str, Any]:
-    one = timeline.sessions[number]
-    T = one.T_place_session
-    assert T is not None
-    position = ", ".join(f"{v:.2f}" for v in T[:-1, -1])
-    return {
-        "name": one.name,
-        "input": one.input,
-        "color": _session_color(number),
-        "date": format_date_time(one.first_ns),
-        "seconds": 1e-9 * (one.last_ns - one.first_ns),
-        "overlap": one.overlap,
-        "position": position,
-        # + 0.0 turns a negative zero into zero
-        "heading": round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0,
-    }
-
-
-def _thumbnails_data(occupancy: GridMap, timeline: Timeline) -> list[dict[str, Any]]:
-    """A small picture of the map as of every session."""
-    if not occupancy.p_occupied.size:
-        return []
-    pictures = PlacePictures(occupancy, timeline, _THUMBNAIL_PIXELS)
-    return [
-        {
-            "view": pictures.view,
-            "image": data_uri(pictures.draw(k)),
-            "name": one.name,
-            "date": timeline.date(k),
-            "counts": _count_kinds(timeline.changes_at(k)),
-        }
-        for k, one in enumerate(timeline.sessions)
-    ]
-
-
 def _step_data(timeline: Timeline, number: int, pictures: "PlacePictures | None") -> dict[str, Any]:
-    """The changes from the session before to one, in a table and on the map."""
-    before, after = (timeline.sessions[k] for k in (number - 1, number))
-    changes = timeline.changes_at(number)
-    listed = changes[:_MAX_ROWS]
-    data: dict[str, Any] = {
-        "number": number,
-        "names": (before.name, after.name),
-        "dates": (timeline.date(number - 1), timeline.date(number)),
-        "counts": _count_kinds(changes),
-        "total": len(changes),
-        "rows": [_change_row(one, timeline) for one in listed],
-        "marks": None,
-    }
-    if pictures is not None and changes:
-        patch = pictures.draw_difference(number)
-        data["marks"] = [place_mark(one, pictures.view) for one in listed]
-        data["patch"] = (
-            None if patch is None else (*patch[:2], *patch.image.size, data_uri(patch.image))
-        )
-    return data
-
-
-def _change_row(change: SessionChange, timeline: Timeline) -> dict[str, Any]:
-    (low, high), *earlier = change.boxes
-    names = [one.name for one in timeline.sessions]
-    before, after = (names.index(name) for name in change.between)
-    return {
-        "change": change,
-        "center": 0.5 * (low + high),
-        "start": 0.5 * sum(earlier[0]) if earlier else None,
-        "size": high - low,
-        "since": "" if before == after - 1 else change.between[0],
-    }
+    """The changes from the session before to one on the map, and how that differs from the map as
+    it was written."""
+    changes = timeline.changes_at(number)[:_MAX_ROWS]
+    if pictures is None or not changes:
+        return {"marks": None, "patch": None}
+    marks = [place_mark(one, pictures.view) for one in changes]
+    patch = pictures.draw_difference(number)
+    return {"marks": marks, "patch": patch and (*patch[:2], *patch[2].size, data_uri(patch[2]))}
 
 
 def place_mark(change: SessionChange, view: MapView) -> dict[str, Any]:
@@ -237,14 +173,6 @@ def place_mark(change: SessionChange, view: MapView) -> dict[str, Any]:
         "centers": [(x + 0.5 * w, y + 0.5 * h) for x, y, w, h in boxes],
         "text": (x, top + max(view.size) * _FONT_SHARE, is_before),
     }
-
-
-class Patch(NamedTuple):
-    """A part of a picture: column and row of its upper left pixel."""
-
-    left: int
-    top: int
-    image: Image.Image
 
 
 class PlacePictures:
@@ -285,8 +213,9 @@ class PlacePictures:
         colors = KIND_COLORS["appeared"], KIND_COLORS["gone"]
         return color_levels(self._levels_as_of(session), *colors)
 
-    def draw_difference(self, session: int) -> Patch | None:
-        """The difference of `draw` of a session from `draw_map`, transparent elsewhere."""
+    def draw_difference(self, session: int) -> tuple[int, int, Image.Image] | None:
+        """The difference of `draw` of a session from `draw_map`, transparent elsewhere, after
+        column and row of its upper left pixel."""
         levels = self._levels_as_of(session)
         differs = levels != self._levels
         if not differs.any():
@@ -296,7 +225,7 @@ class PlacePictures:
         pixels = np.where(differs, levels, np.uint8(_CLEAR))[part]
         image = color_levels(pixels, KIND_COLORS["appeared"], KIND_COLORS["gone"], (0, 0, 0))
         image.info["transparency"] = _CLEAR
-        return Patch(int(columns[0]), int(rows[0]), image)
+        return int(columns[0]), int(rows[0]), image
 
     def _levels_as_of(self, session: int) -> NDArray[np.uint8]:
         now, came, left = (one[self._drawn] for one in self._timeline.cells_as_of(session))

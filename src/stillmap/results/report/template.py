@@ -24,7 +24,7 @@ def render_page(data: Mapping[str, Any], template: str = "report.html.j2") -> st
     script = (_TEMPLATES / "map_view.js").read_text(encoding="utf-8")
     # without its hash, browsers run no script of the page
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    known = {"run": None, "result": None, "place": None, "script": script, "script_hash": digest}
+    known = {"result": None, "place": None, "script": script, "script_hash": digest}
     page = _environment().get_template(template)
     return page.render({**known, **data, "version": package_version()})
 

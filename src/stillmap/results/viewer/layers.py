@@ -235,11 +235,11 @@ class Layers:
 
     def _draw_beams(self, scan: int) -> None:
         assert self._beams is not None
-        view = self._beams.scan_view(scan)
-        ends = view.ends - self._nodes.origin(3)
+        ends, p_static, sensor = self._beams.scan_view(scan)
+        ends = ends - self._nodes.origin(3)
         with self._nodes.server.atomic():
             self._ends.points = ends.astype(np.float32)
-            self._ends.colors = color_by_p_static(view.p_static)
+            self._ends.colors = color_by_p_static(p_static)
         some = ends[sample_indices(len(ends), _MAX_RAYS)]
-        begin = np.broadcast_to(view.origin - self._scene.origin, some.shape)
+        begin = np.broadcast_to(sensor - self._scene.origin, some.shape)
         self._ray.points = np.stack([begin, some], axis=1).astype(np.float32)

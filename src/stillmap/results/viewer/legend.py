@@ -1,7 +1,7 @@
-"""The keys of layers and actions, and the legend of what is visible, as HTML."""
+"""The keys of layers and actions, and the legend, as HTML."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from stillmap.results.colors import (
     BLUE,
@@ -11,10 +11,11 @@ from stillmap.results.colors import (
     ORANGE,
     STATIC_COLORS,
     TEAL,
+    Rgb,
     color_by_id,
 )
 from stillmap.results.report.figures import UNKNOWN
-from stillmap.results.viewer.layers import DYNAMIC, HEIGHT, PICTURES, STATIC, Layers
+from stillmap.results.viewer.layers import DYNAMIC, STATIC, Layers
 from stillmap.results.viewer.nodes import TEXT_STYLE
 
 # W, A, S, D, Q, E and the vertical arrows move viser's camera
@@ -47,15 +48,7 @@ ACTION_KEYS = {
     "Next session": "pagedown",
     "Previous session": "pageup",
 }
-_KEYS = (
-    "<b>Space</b> play or pause; <b>← →</b> one scan; <b>Home End</b> first, last scan; "
-    "<b>1 to 0, N</b> layers; <b>M</b> measure; <b>Esc</b> clear; <b>V</b> default view; "
-    "<b>L</b> legend; <b>W A S D Q E, ↑ ↓</b> move the camera; <b>Ctrl K</b> all commands"
-)
-_PLACE_KEYS = (
-    "; <b>Page ↑ Page ↓</b> one session; "
-    "<b>T, C, B</b> trajectories of sessions, changes, their labels"
-)
+_ARROWS = {"arrowleft": "←", "arrowright": "→", "pageup": "Page ↑", "pagedown": "Page ↓"}
 
 # styles of a swatch; its color follows
 _DOT = "border-radius:50%;width:.7em;height:.7em;margin:0 .1em;background:"
@@ -90,24 +83,23 @@ _ROWS: list[tuple[str, str, Sequence[Sequence[int]], str]] = [
 ]
 
 
-def legend_html(layers: Layers, coloring: str) -> str:
-    """A row for each meaning of a color in the visible layers.
-
-    Args:
-        layers: of the scene.
-        coloring: what the points are colored by.
-    """
+def legend_html(layers: Layers) -> str:
+    """A row for each meaning of a color in the layers."""
     low, high = layers.heights
-    words = {
-        PICTURES: "static points in the colors of the pictures",
-        HEIGHT: f"static points by height z, {low:.1f} m to {high:.1f} m",
-    }.get(coloring, "static points, lighter if higher")
-    stops = HEIGHT_COLORS if coloring == HEIGHT else STATIC_COLORS
-    ramp = _RAMP + ",".join(f"rgb{color}" for color in stops) + ")"
-    rows = [_row([] if coloring == PICTURES else [ramp], words)] if layers.is_shown(STATIC) else []
-    for layer, style, colors, meaning in _ROWS:
-        if layers.is_shown(layer):
-            rows.append(_row([f"{style}rgb{tuple(color)}" for color in colors], meaning))
+    static: list[tuple[Sequence[Rgb], str]] = [
+        (STATIC_COLORS, "static points, lighter if higher"),
+        (HEIGHT_COLORS, f"static points by height z, {low:.1f} m to {high:.1f} m"),
+    ]
+    rows = [
+        _row([_RAMP + ",".join(f"rgb{color}" for color in stops) + ")"], words)
+        for stops, words in static
+        if STATIC in layers.clouds
+    ]
+    rows += [
+        _row([f"{style}rgb{tuple(color)}" for color in colors], meaning)
+        for layer, style, colors, meaning in _ROWS
+        if layer in layers.default_visibility
+    ]
     return f'<div style="{TEXT_STYLE};padding-top:.6em">{"".join(rows)}</div>'
 
 
@@ -120,7 +112,12 @@ def _row(swatches: Sequence[str], words: str) -> str:
     )
 
 
-def help_html(is_place: bool = False) -> str:
-    """The line that lists the keys."""
-    keys = _KEYS + _PLACE_KEYS * is_place
-    return f'<div style="{TEXT_STYLE};padding-bottom:.6em">Keys: {keys}.</div>'
+def help_html(actions: Iterable[str]) -> str:
+    """The line that lists the keys of actions; those of layers stand beside their boxes."""
+    keys = {action: key for action, key in ACTION_KEYS.items() if action in actions}
+    listed = [
+        f"<b>{_ARROWS.get(key, key.capitalize())}</b> {action.lower()}"
+        for action, key in keys.items()
+    ]
+    listed += ["<b>W A S D Q E, ↑ ↓</b> move the camera", "<b>Ctrl K</b> all commands"]
+    return f'<div style="{TEXT_STYLE};padding-bottom:.6em">Keys: {"; ".join(listed)}.</div>'

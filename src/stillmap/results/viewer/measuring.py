@@ -79,8 +79,6 @@ class Measuring:
         self._button = gui.add_button("Measure")
         self._button.on_click(defer(self.toggle))
         self._text: Any = gui.add_markdown("", visible=False)
-        self._clear_button = gui.add_button("Clear", visible=False)
-        self._clear_button.on_click(defer(self.clear))
 
     @property
     def distances(self) -> list[float]:
@@ -139,4 +137,3 @@ class Measuring:
             lines.append(f"{message}Click on the {end} point.")
         self._text.content = "  \n".join(escape_markdown(line) for line in lines)
         self._text.visible = bool(lines)
-        self._clear_button.visible = bool(self.points)

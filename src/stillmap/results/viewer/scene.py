@@ -33,7 +33,6 @@ MAX_POINTS: dict[Part, int] = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
 _MAX_MODELS = 256 << 20  # bytes of all object models
 _MAX_RECORD = 1 << 20  # bytes of objects/NNNN.json
-_MAX_COORDINATE = 8_000.0  # m; beyond it float32 loses millimeters, and the origin is shifted
 _GROUND_QUANTILE = 0.05  # of the heights near the trajectory
 _GROUND_RADIUS = 15.0  # m around the trajectory
 _MIN_IMAGE_SIZE = 2_000  # pixels; browsers blur smaller images
@@ -137,7 +136,9 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
             what = "is damaged: its scans are not those of the place"
             raise InputError(what, where=str(folder / SESSIONS))
         pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
-    origin, notes = _origin(poses), list[str]()
+    # near the scene: far away float32 would lose millimeters
+    positions, notes = poses[:, :3, 3], list[str]()
+    origin: Float = np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0)))
     clouds = _read_clouds(folder, origin, notes)
     tracks, surface = read_tracks(folder / "objects" / "objects.json"), None
     if (folder / "mesh.glb").exists():
@@ -159,13 +160,6 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
         timeline=timeline,
         pictures=pictures,
     )
-
-
-def _origin(poses: Float) -> Float:
-    positions = poses[:, :3, 3]
-    if np.abs(positions).max() < _MAX_COORDINATE:
-        return np.zeros(3)
-    return np.asarray(np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0))))
 
 
 def _read_clouds(folder: Path, origin: Float, notes: list[str]) -> dict[str, Points]:
@@ -248,20 +242,6 @@ def _read_or_note(notes: list[str], read: Callable[..., Value], *arguments: obje
         return None
 
 
-class ScanView(NamedTuple):
-    """Returns of one scan.
-
-    Attributes:
-        ends: (n, 3) m in the map frame; z = 0 in 2D.
-        p_static: (n,) float32.
-        origin: (3,) m, position of the sensor.
-    """
-
-    ends: NDArray[np.float64]
-    p_static: NDArray[np.float32]
-    origin: NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class Beams:
     """The recording of a result with labels and poses.
@@ -278,8 +258,15 @@ class Beams:
     poses: NDArray[np.float64]
     slam: SlamOptions
 
-    def scan_view(self, scan: int, max_count: int = MAX_BEAMS) -> ScanView:
-        """At most `max_count` returns of a scan; reads only this scan and its neighbors."""
+    def scan_view(
+        self, scan: int, max_count: int = MAX_BEAMS
+    ) -> tuple[Float, NDArray[np.float32], Float]:
+        """At most `max_count` returns of a scan; reads only this scan and its neighbors.
+
+        Returns:
+            (n, 3) m, end points in the map frame, z = 0 in 2D; their P(static) (n,); and (3,) m,
+            position of the sensor.
+        """
         D, T = self.recording.dimension, self.recording.n_scans
         first, end = max(scan - _NEIGHBORS[D], 0), min(scan + _NEIGHBORS[D] + 1, T)
         near = deskew_recording(
@@ -295,7 +282,7 @@ class Beams:
         origin[:D] = T_map_sensor[:D, D]
         p_static = np.asarray(self.p_static[beams][use])
         self.recording.release_pages(self.p_static)
-        return ScanView(ends, p_static, origin)
+        return ends, p_static, origin
 
     def dynamic_ends(self, max_count: int) -> Float:
         """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns.

@@ -9,7 +9,6 @@ itself from requests to elsewhere.
 import gzip
 import html
 import logging
-import os
 import re
 import secrets
 from collections.abc import Iterator, Mapping
@@ -26,7 +25,6 @@ from stillmap.core.errors import InputError
 
 HOST = "127.0.0.1"
 _TOKEN_BYTES = 24
-_PORT_VARIABLE = "_VISER_PORT_OVERRIDE"  # of the environment
 
 # any port: a tunnel may use another one
 _LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
@@ -120,14 +118,9 @@ def start_server(port: int, title: str) -> Server:
     # websockets logs malformed requests with a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     token = secrets.token_urlsafe(_TOKEN_BYTES)
-    override = os.environ.pop(_PORT_VARIABLE, None)  # of viser's port
-    try:
-        with _quiet_console(), _guard_servers(title, token) as ports:
-            server = Server(HOST, port, label="stillmap", verbose=False)
-            server.token = token
-    finally:
-        if override is not None:
-            os.environ[_PORT_VARIABLE] = override
+    with _quiet_console(), _guard_servers(title, token) as ports:
+        server = Server(HOST, port, label="stillmap", verbose=False)
+        server.token = token
     if not ports:
         stop_server(server)
         raise RuntimeError("this version of viser does not use websockets.asyncio.server.serve")

@@ -134,9 +134,6 @@ class Window:
         changed = [self._layers.set_visible(name, box.value) for name, box in self._boxes.items()]
         if wanted != self.scan or any(changed):
             self.show(wanted)
-        legend = legend_html(self._layers, self._coloring.value)
-        if self._legend.content != legend:
-            self._legend.content = legend
 
     def _advance(self, passed: float) -> int:
         """The scan after `passed` s of playback; the first one after the last."""
@@ -234,11 +231,11 @@ class Window:
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         for note in scene.notes:
             gui.add_markdown(escape_markdown(note))
-        gui.add_html(help_html(is_place=scene.timeline is not None))
+        gui.add_html(help_html(self._actions()))
         self._panel: Any = gui.add_panel()
         self._panel.float(x=_LEGEND_MARGIN, y=-_LEGEND_MARGIN, width=_LEGEND_WIDTH)
         with self._panel.add_tab("Legend"):
-            self._legend: Any = gui.add_html("")
+            gui.add_html(legend_html(self._layers))
 
 
 def _toggle(control: Any, name: str = "value") -> None:
