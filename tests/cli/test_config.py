@@ -109,11 +109,17 @@ def test_unknown_option_suggests_the_nearest(capsys, tmp_path, key, nearest):
     [
         (("--set", "em.prior=2"), ("--set: ", "em.prior")),
         (("--set", "em.prior=high"), ("--set: ", "em.prior", "'high'")),
-        (("--set", "em.time_bin=0"), ("--set: ", "'em.time_bin' must be at least 0.01, got 0")),
+        (
+            ("--set", "em.time_bin=0"),
+            ("--set: ", "'em.time_bin' must be at least 0.01 and at most 3600"),
+        ),
         (("--set", "em.time_bin=nan"), ("--set: ", "em.time_bin", "finite")),
         (("--set", "em.label_tolerance=2"), ("--set: ", "em.label_tolerance", "at most 1")),
         (("--set", "em.held_out=1"), ("--set: ", "em.held_out", "0, or at least 2")),
-        (("--set", "em.change_detection=perhaps"), ("--set: ", "em.change_detection", "boolean")),
+        (
+            ("--set", "em.change_detection=perhaps"),
+            ("--set: ", "change_detection", "true or false"),
+        ),
         (("--set", "output.map_state=first"), ("--set: ", "output.map_state", "majority")),
         (("--set", "estimator=guess"), ("--set: ", "estimator", "hit-ratio")),
         (("--set", "em=1"), ("--set: ", "'em' is a section")),

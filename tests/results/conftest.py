@@ -4,9 +4,9 @@ import re
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
-import pydantic
 import pytest
 
+from stillmap.core.config import CheckedOptions
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
@@ -39,19 +39,19 @@ WALLS = [
 ]
 
 
-@pydantic.dataclasses.dataclass(frozen=True)
-class EmOptions:
+@dataclass(frozen=True)
+class EmOptions(CheckedOptions):
     prior: float = 0.9
     note: str = "a <b>bold</b> & 'quoted' note"
     seed: int | None = None
 
 
-@pydantic.dataclasses.dataclass(frozen=True)
-class FakeOptions:
+@dataclass(frozen=True)
+class FakeOptions(CheckedOptions):
     estimator: str = "stillmap"
-    em: EmOptions = field(default_factory=EmOptions)
-    objects: ObjectOptions = field(default_factory=ObjectOptions)
-    output: OutputOptions = field(default_factory=OutputOptions)
+    em: EmOptions = field(default=EmOptions())
+    objects: ObjectOptions = field(default=ObjectOptions())
+    output: OutputOptions = field(default=OutputOptions())
 
 
 @dataclass(frozen=True, eq=False)

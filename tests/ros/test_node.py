@@ -182,7 +182,7 @@ def check_map(simulation, grid):
     ("parameter", "says"),
     [
         ("resolution:=-1.0", "'resolution' must be more than 0, got -1.0"),
-        ("map_frame:=3", "'map_frame' must be a valid string, got 3"),
+        ("map_frame:=3", "'map_frame' must be a text, got 3"),
         ("resolution=", "arguments of ROS"),
     ],
 )

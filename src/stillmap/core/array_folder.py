@@ -4,7 +4,6 @@ A JSON file says what the folder is, in which `format_version`; it is written la
 written whole by `core.files.atomic_folder`.
 """
 
-import json
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
@@ -31,7 +31,6 @@ def write_arrays(
     arrays: Mapping[str, NDArray[Any] | None],
     name: str = "",
     record: Any = None,
-    indent: int | None = 1,
 ) -> None:
     """Write arrays as NAME.npy, those that are None not, then the JSON file of the folder.
 
@@ -40,13 +39,12 @@ def write_arrays(
         arrays: by name.
         name: of the JSON file; empty: none is written.
         record: its content, a mapping, to which `format_version` is added.
-        indent: of that; None: one line, which is written ten times as fast.
     """
     for key, array in arrays.items():
         if array is not None:
             write_npy(folder / f"{key}.npy", array)
     if name:
-        write_json(folder / name, {"format_version": FORMAT_VERSION, **record}, indent)
+        write_json(folder / name, {"format_version": FORMAT_VERSION, **record})
 
 
 def read_array(
@@ -122,25 +120,15 @@ def read_record(path: Path, hint: str = "", max_bytes: int = _MAX_JSON) -> dict[
 
 
 def parse(content: Any, kind: type[Model], path: Path, hint: str = "") -> Model:
-    """JSON values as a dataclass or another type that pydantic knows.
+    """JSON values as a dataclass or another type that msgspec knows.
 
     Raises:
         InputError: they are none; names the first entry at fault, of the file `path`.
     """
-    from pydantic import TypeAdapter, ValidationError  # slow to load
-
     try:
-        # in strict mode, which takes no text for a number; of JSON, whose lists may be tuples
-        adapter, text = TypeAdapter(kind), json.dumps(content, ensure_ascii=False)
-        encoded = text.encode("utf-8", "replace")
-        value = adapter.validate_json(encoded, strict=True)
-        # file names that are no UTF-8 hold what pydantic's JSON cannot: the types are right by now
-        return value if encoded.decode("utf-8") == text else adapter.validate_python(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        what = f"is damaged: {place}: {first['msg']}" if place else f"is damaged: {first['msg']}"
-        raise InputError(what, where=str(path), hint=hint) from error
+        return msgspec.convert(content, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"is damaged: {error}", where=str(path), hint=hint) from error
 
 
 def open_npy(path: Path, scratch: Path | None = None, rows: int | None = None) -> NDArray[Any]:

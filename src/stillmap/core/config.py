@@ -1,47 +1,151 @@
-"""Options: frozen pydantic dataclasses, changes of them, and the same as TOML.
+"""Options: frozen dataclasses that check their values, changes of them, and the same as TOML.
 
 An option is a field with its default, range and meaning:
 
-    @dataclass(frozen=True, config=STRICT)
-    class EmOptions:
+    @dataclass(frozen=True)
+    class EmOptions(CheckedOptions):
         prior: float = option(0.9, "Prior probability p(c = 1) that a beam is static.", gt=0, lt=1)
 """
 
 import dataclasses
 import json
+import math
 import re
 import tomllib
+import types
 import typing
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from pydantic import ConfigDict, Field, ValidationError
-from pydantic.fields import FieldInfo
+import msgspec
+from msgspec import Meta
 
 from stillmap.core.errors import InputError, closest_match
 from stillmap.core.input_files import read_text
 
 T = TypeVar("T")
 
-STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
-
 _MAX_INTEGER = 2**31 - 1  # the compiled core counts in 32 bits
 
-Count = Annotated[int, Field(le=_MAX_INTEGER)]
+Count = Annotated[int, Meta(le=_MAX_INTEGER)]
 
 _MAX_FILE_SIZE = 64 << 10  # bytes; Python needs minutes for more of nested keys
 
+_BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+_LIMITS = (*_BOUNDS, "min_length", "max_length", "pattern")
+_NOUNS = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
+
 
 def option(default: Any, doc: str, **limits: Any) -> Any:
-    """A field of a pydantic dataclass.
+    """A field of checked options.
 
     Args:
         default: None where the option may be unset.
         doc: meaning and unit.
-        limits: `ge`, `gt`, `le`, `lt`, and whatever else `pydantic.Field` takes.
+        limits: `ge`, `gt`, `le`, `lt`, and whatever else `msgspec.Meta` takes.
     """
-    return Field(default=default, description=doc, **limits)
+    return dataclasses.field(default=default, metadata={"doc": doc, "limits": limits})
+
+
+class OptionError(ValueError):
+    """A value that an option cannot have.
+
+    Attributes:
+        name: of the option, without its section.
+        what: what it must be, and what it is.
+    """
+
+    def __init__(self, name: str, what: str) -> None:
+        self.name, self.what = name, what
+        super().__init__(f"'{name}' {what}")
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckedOptions:
+    """Options, all of whose values are of their types and within their ranges.
+
+    Raises:
+        OptionError: one is not.
+    """
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, default = getattr(self, field.name), field.default
+            if not dataclasses.is_dataclass(default):
+                if value is not default:
+                    declared = declared_options(type(self))[field.name]
+                    object.__setattr__(self, field.name, _check(value, declared, field.name))
+            elif not isinstance(value, type(default)):
+                raise OptionError(field.name, f"must be {type(default).__name__}, got {value!r}")
+
+
+class Declaration(NamedTuple):
+    """What a class says about one of its options.
+
+    Attributes:
+        kind: its type where it is set.
+        is_optional: whether it may be unset.
+        limits: by their names in `msgspec.Meta`.
+        default: None: unset.
+        doc: meaning and unit.
+    """
+
+    kind: Any
+    is_optional: bool
+    limits: dict[str, Any]
+    default: Any
+    doc: str
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """Allowed values; empty where there is a range or none."""
+        is_choice = typing.get_origin(self.kind) is typing.Literal
+        return typing.get_args(self.kind) if is_choice else ()
+
+
+def declared_options(kind: Any) -> dict[str, Declaration]:
+    """The options of a class by name; sections are none, nor fields of a plain dataclass."""
+    return _declare_all(kind) if issubclass(kind, CheckedOptions) else {}
+
+
+@cache
+def _declare_all(kind: type[CheckedOptions]) -> dict[str, Declaration]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    fields = [one for one in dataclasses.fields(kind) if not dataclasses.is_dataclass(one.default)]
+    return {field.name: _declare(field, hints[field.name]) for field in fields}
+
+
+def _declare(field: dataclasses.Field[Any], hint: Any) -> Declaration:
+    is_optional = typing.get_origin(hint) in (types.UnionType, typing.Union)
+    kind, notes = typing.get_args(hint)[0] if is_optional else hint, list[Meta]()
+    if typing.get_origin(kind) is Annotated:
+        kind, *notes = typing.get_args(kind)
+    limits = {
+        key: limit for note in notes for key in _LIMITS if (limit := getattr(note, key)) is not None
+    }
+    limits |= field.metadata.get("limits", {})
+    return Declaration(kind, is_optional, limits, field.default, field.metadata.get("doc", ""))
+
+
+def _check(value: Any, declared: Declaration, name: str) -> Any:
+    """The value of an option as its type: integers as floats, lists as tuples.
+
+    Raises:
+        OptionError: it is of another type, or out of range.
+    """
+    if value is None and declared.is_optional:
+        return None
+    needed = " or ".join(map(repr, declared.choices)) or _NOUNS.get(declared.kind, "a list")
+    with suppress(msgspec.ValidationError):
+        plain = float(value) if isinstance(value, float) else value  # NumPy's are of a subclass
+        checked = msgspec.convert(plain, declared.kind)
+        if not isinstance(checked, float) or math.isfinite(checked):
+            needed = describe_range(declared.limits) or needed
+            return msgspec.convert(checked, Annotated[declared.kind, Meta(**declared.limits)])
+    raise OptionError(name, f"must be {needed}, got {_format(value)}")
 
 
 class OptionInfo(NamedTuple):
@@ -95,29 +199,10 @@ def _override(options: T, changes: Mapping[str, Any], where: str, prefix: str, t
         values[key] = _override(current, value, where, f"{name}.", top) if is_section else value
     try:
         return dataclasses.replace(options, **values)  # type: ignore[type-var]
-    except ValidationError as error:
-        raise InputError(_describe(error, prefix), where=where) from error
-    except ValueError as error:  # of what holds the sections, or digits without end
+    except OptionError as error:
+        raise InputError(f"'{prefix}{error.name}' {error.what}", where=where) from error
+    except ValueError as error:  # of a check between options, which names them
         raise InputError(str(error), where=where) from error
-
-
-_SHORTER = {
-    "greater than or equal to": "at least",
-    "greater than": "more than",
-    "less than or equal to": "at most",
-}
-
-
-def _describe(error: ValidationError, prefix: str) -> str:
-    """The first fault on one line."""
-    fault = error.errors(include_url=False)[0]
-    if fault["type"] == "value_error":  # of a check between options, which names them
-        return str(fault["ctx"]["error"])
-    name = prefix + str(fault["loc"][0])
-    what = fault["msg"].replace("Input should be", "must be")
-    for words, short in _SHORTER.items():
-        what = what.replace(words, short)
-    return f"'{name}' {what}, got {_format(fault['input'])}"
 
 
 def _format(value: Any) -> str:
@@ -158,32 +243,24 @@ def to_dict(options: Any) -> dict[str, Any]:
 
 def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
     """All options, section by section; options of a section come before its sub-sections."""
-    sections = _section_names(options)
-    for name, info in declared_fields(options).items():
-        if name not in sections:
-            yield _describe_option(f"{prefix}{name}", getattr(options, name), info)
-    for name in sections:
+    for name, one in declared_options(type(options)).items():
+        kind = (
+            "list" if typing.get_origin(one.kind) is tuple else getattr(one.kind, "__name__", "str")
+        )
+        kind = ("str" if one.choices else kind) + " or unset" * (one.default is None)
+        # what every integer has to fit into is no range
+        limits = describe_range({k: v for k, v in one.limits.items() if v != _MAX_INTEGER})
+        value = getattr(options, name)
+        yield OptionInfo(f"{prefix}{name}", value, one.default, kind, one.choices, limits, one.doc)
+    for name in _section_names(options):
         yield from iter_options(getattr(options, name), f"{prefix}{name}.")
 
 
-def _describe_option(name: str, value: Any, info: FieldInfo) -> OptionInfo:
-    kinds = [kind for kind in typing.get_args(info.annotation) if kind is not type(None)]
-    kind: Any = kinds[0] if len(kinds) == 1 else info.annotation
-    is_choice = typing.get_origin(kind) is typing.Literal
-    choices = typing.get_args(kind) if is_choice else ()
-    word = "list" if typing.get_origin(kind) is tuple else getattr(kind, "__name__", "str")
-    doc = info.description or ""
-    word = ("str" if is_choice else word) + " or unset" * (info.default is None)
-    return OptionInfo(name, value, info.default, word, choices, _limits(info), doc)
-
-
-def _limits(info: FieldInfo) -> str:
-    """The range of a number in words; what every integer has to fit into is none."""
-    words = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
-    bounds = {key: getattr(m, key) for m in info.metadata for key in words if hasattr(m, key)}
-    if bounds.get("le") == _MAX_INTEGER:
-        del bounds["le"]
-    return " and ".join(f"{words[key]} {bounds[key]:.10g}" for key in words if key in bounds)
+def describe_range(limits: Mapping[str, Any]) -> str:
+    """The range of a number in words; empty where there is none."""
+    return " and ".join(
+        f"{words} {limits[key]:.10g}" for key, words in _BOUNDS.items() if key in limits
+    )
 
 
 def iter_names(options: Any) -> Iterator[str]:
@@ -283,16 +360,10 @@ def _heading(options: Any, section: str) -> Iterator[str]:
     yield from ("", f"# {summary}", f"[{section}]")
 
 
-def declared_fields(options: Any) -> dict[str, FieldInfo]:
-    """Options of pydantic; of a plain dataclass its sections."""
-    declared: dict[str, FieldInfo] = getattr(options, "__pydantic_fields__", {})
-    return declared
-
-
 def _section_names(options: Any) -> list[str]:
     names = [field.name for field in dataclasses.fields(options)]
     return [name for name in names if dataclasses.is_dataclass(getattr(options, name))]
 
 
 def _names(options: Any) -> set[str]:
-    return {*declared_fields(options), *_section_names(options)}
+    return {*declared_options(type(options)), *_section_names(options)}

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
-from typing import Annotated, Any, Literal
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Literal, get_type_hints
 
+import msgspec
 import numpy as np
-from annotated_types import Ge, Le
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.json import to_jsonable
 
 # of notes in a file, which may hold anything: no sum and no angle in degrees overflows
-Count = Annotated[int, Ge(0), Le(2**53)]
-Stamp = Annotated[int, Ge(-(2**63)), Le(2**63 - 1)]
-Angle = Annotated[float, Ge(-1e3), Le(1e3)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]
+Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Angle = Annotated[float, Meta(ge=-1e3, le=1e3)]
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class SensorNotes:
     name: str = ""
     frame: str | None = None
     scans: Count | None = None
-    places: Annotated[int, Ge(1), Le(2**53)] = 1
+    places: Annotated[int, Meta(ge=1, le=2**53)] = 1
     beams_per_scan: Count | None = None
     start_angle: Angle | None = None
     angle_step: Angle | None = None
@@ -189,18 +191,13 @@ class Source:
     @classmethod
     def from_dict(cls, content: Any) -> Source:
         """The notes of JSON values, without those that another program wrote in another form."""
-        from pydantic import TypeAdapter, ValidationError  # slow to load
-
         content = to_jsonable(content)  # infinite numbers become None
         if not isinstance(content, dict):
             return cls()
-        names = {field.name for field in fields(cls)} - {"details"}
-        known = {key: value for key, value in content.items() if key in names}
-        adapter = TypeAdapter(cls)
-        try:
-            source = adapter.validate_python(known)
-        except ValidationError as error:
-            wrong = {each["loc"][0] for each in error.errors()}
-            source = adapter.validate_python({k: v for k, v in known.items() if k not in wrong})
-        source.details = {key: value for key, value in content.items() if key not in names}
+        kinds = get_type_hints(cls, include_extras=True)
+        del kinds["details"]
+        source = cls(details={key: value for key, value in content.items() if key not in kinds})
+        for key in kinds.keys() & content:
+            with suppress(msgspec.ValidationError):
+                setattr(source, key, msgspec.convert(content[key], kinds[key]))
         return source

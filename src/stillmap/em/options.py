@@ -1,18 +1,16 @@
 """Options of the EM loop and of the occupancy HMM."""
 
-from typing import Literal, Self
+from dataclasses import dataclass
+from typing import Literal
 
-from pydantic import model_validator
-from pydantic.dataclasses import dataclass
-
-from stillmap.core.config import STRICT, Count, option
+from stillmap.core.config import CheckedOptions, Count, option
 
 # state of changed places in the map: the last one, or the one held longest
 MapState = Literal["last", "majority", "open", "shut"]
 
 
-@dataclass(frozen=True, config=STRICT)
-class EmOptions:
+@dataclass(frozen=True)
+class EmOptions(CheckedOptions):
     """The EM loop (Fig. 2), the occupancy HMM, and the detection of changes."""
 
     prior: float = option(0.9, "Prior probability p(c = 1) that a beam is static.", gt=0.0, lt=1.0)
@@ -50,9 +48,8 @@ class EmOptions:
         False, "List changes of 3D recordings as 3D boxes as well; takes more time and memory."
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def __post_init__(self) -> None:
         """Checks that one held-out scan in n leaves others."""
+        super().__post_init__()
         if self.held_out == 1:
             raise ValueError("'em.held_out' must be 0, or at least 2")
-        return self

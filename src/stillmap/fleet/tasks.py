@@ -19,8 +19,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from stillmap.core.errors import InputError, split_advice
 from stillmap.core.files import package_version, write_text
@@ -161,8 +161,8 @@ def read_made(root: str, folder: str) -> Outcome | None:
     fs, path = open_location(root)
     with explain(f"{root}/{folder}", "read"):
         try:
-            return TypeAdapter(Outcome).validate_json(fs.cat_file(f"{path}/{folder}/{MADE}"))
-        except (FileNotFoundError, NotADirectoryError, ValidationError):
+            return msgspec.json.decode(fs.cat_file(f"{path}/{folder}/{MADE}"), type=Outcome)
+        except (FileNotFoundError, NotADirectoryError, msgspec.DecodeError):
             return None
 
 

@@ -14,19 +14,18 @@ import io
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
-from stillmap.core.config import STRICT, load_toml, override
+from stillmap.core.config import CheckedOptions, load_toml, override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
@@ -42,16 +41,16 @@ from stillmap.io.trajectory import pose_from_quaternion, pose_from_row, rigid_tr
 # counts of the numbers of each distortion model
 MODELS = {"": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 
-_Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # pixels, metres, seconds
-_Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
-_Matrix = list[_Number] | list[list[_Number]]
-_Three = Annotated[list[_Number], Field(min_length=3, max_length=3)]
-_Four = Annotated[list[_Number], Field(min_length=4, max_length=4)]
-_Path = Annotated[str, Field(pattern=r"^[^\x00]+$")]
+_Number = Annotated[float, Meta(ge=-1e6, le=1e6)]  # pixels, metres, seconds
+_Pixels = Annotated[int, Meta(ge=1, le=1 << 16)]
+_Matrix = list[_Number | list[_Number]]
+_Three = Annotated[list[_Number], Meta(min_length=3, max_length=3)]
+_Four = Annotated[list[_Number], Meta(min_length=4, max_length=4)]
+_Path = Annotated[str, Meta(pattern=r"^[^\x00]+$")]
 
 
-@dataclass(frozen=True, config=STRICT)
-class CameraOverride:
+@dataclass(frozen=True)
+class CameraOverride(CheckedOptions):
     """Values of one camera; None: not given. See the beginning of this file.
 
     `time_offset` (s) is added to the stamps of its images; `folder` holds images outside the
@@ -75,8 +74,8 @@ class CameraOverride:
     folder: _Path | None = None
     times: _Path | None = None
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.width is None) != (self.height is None):
             raise ValueError("'width' and 'height' go together")
         if self.times is not None and self.folder is None:
@@ -90,7 +89,6 @@ class CameraOverride:
             raise ValueError(f"{what}, got {count}")
         self.intrinsics()
         self.pose()
-        return self
 
     def intrinsics(self) -> Float | None:
         """(3, 3) pinhole matrix."""

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
-from pydantic import Field, FiniteFloat
 
 from stillmap.core.array_folder import (
     count_rows,
@@ -44,9 +44,10 @@ _OPTIONAL = {  # arrays that may be missing, by the entry of the header that say
 }
 _ARRAYS = ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor", *_OPTIONAL.values())
 _MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
-_Count = Annotated[int, Field(ge=0, lt=1 << 60)]
-_Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
-_Matrix = list[list[FiniteFloat]]
+_Count = Annotated[int, Meta(ge=0, lt=1 << 60)]
+_Pixels = Annotated[int, Meta(ge=1, le=1 << 16)]
+_Number = Annotated[float, Meta(ge=-1e300, le=1e300)]
+_Matrix = list[list[_Number]]
 
 
 @dataclass
@@ -56,7 +57,7 @@ class _CameraHeader:
     height: _Pixels
     K: _Matrix | None
     model: str
-    distortion: list[FiniteFloat]
+    distortion: list[_Number]
     T_base_camera: _Matrix | None
 
 

@@ -1,12 +1,12 @@
 """Options of meshes."""
 
-from pydantic.dataclasses import dataclass
+from dataclasses import dataclass
 
-from stillmap.core.config import STRICT, option
+from stillmap.core.config import CheckedOptions, option
 
 
-@dataclass(frozen=True, config=STRICT)
-class MeshOptions:
+@dataclass(frozen=True)
+class MeshOptions(CheckedOptions):
     """Meshes of 3D recordings: the static surface and the moving objects; see docs/mesh.md."""
 
     enabled: bool | None = option(

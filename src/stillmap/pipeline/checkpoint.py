@@ -4,20 +4,18 @@ It lies in `.NAME.resume/iteration-K/` beside the output NAME, with the key of t
 options, and a hash of its input. The folder is locked while the run lasts.
 """
 
-import dataclasses
 import hashlib
-import json
-import math
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import msgpack
 from numpy.typing import NDArray
-from pydantic import ConfigDict, TypeAdapter
 
 import stillmap._core as _core
 from stillmap import em
@@ -38,7 +36,7 @@ from stillmap.pipeline.options import Options
 _RECORD, _LOCK = "checkpoint.json", "lock"
 _NO_MATTER = ("threads", "output.region")  # options on which no iteration depends
 _INLINE = 64  # numbers: larger arrays have a file of their own
-_FILE, _ARRAY, _GRID = "__file__", "__array__", "__grid__"  # what stands for arrays in JSON
+_FILE, _ARRAY, _GRID = 1, 2, 3  # MessagePack's codes of what stands for arrays and grids
 
 
 class CheckpointFolder:
@@ -73,14 +71,12 @@ class CheckpointFolder:
         record = read_record(path)
         try:
             _require_same_run(record["key"], key, str(self.folder))
-            arrays = {
-                name: open_npy(folder / f"{Path(name).name}.npy") for name in record["arrays"]
-            }
-            if record["digest"] != _digest(record["state"], *arrays.values()):
+            packed, *arrays = (open_npy(folder / f"{k}.npy") for k in range(record["arrays"]))
+            if record["digest"] != _digest(packed, *arrays):
                 raise ValueError("not what was written")
-            values = {**_unpack(record["state"], arrays), "options": options}
-            adapter = TypeAdapter(list[EmState], config=ConfigDict(arbitrary_types_allowed=True))
-            [state] = adapter.validate_python([values])
+            unpack = partial(_unpack, arrays)
+            state = msgpack.decode(packed.data, type=EmState, ext_hook=unpack)
+            state.options = options
             stages.add(record["stages"])
         except InputError:
             raise
@@ -98,14 +94,16 @@ class CheckpointFolder:
         """
         before = self.newest
         work, final = self.folder / "new.part", self.folder / f"iteration-{len(state.records)}"
-        arrays: dict[str, NDArray[Any]] = {}
-        values = _pack({**vars(state), "options": None}, "state", arrays)
-        record = {"key": key, "state": values, "arrays": [*arrays], "stages": stages.to_dict()}
-        record["digest"] = _digest(values, *arrays.values())
+        large = dict[int, NDArray[Any]]()
+        packed = msgpack.encode(state, enc_hook=partial(_pack, large))
+        arrays = [np.frombuffer(packed, np.uint8), *large.values()]
+        record = {"key": key, "arrays": len(arrays), "stages": stages.to_dict()}
+        record["digest"] = _digest(*arrays)
         try:
             remove(work)
             work.mkdir()
-            write_arrays(work, arrays, _RECORD, record, indent=None)
+            files = {str(number): array for number, array in enumerate(arrays)}
+            write_arrays(work, files, _RECORD, record)
             remove(final)
             os.rename(work, final)
         except OSError as error:
@@ -152,40 +150,29 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
         file.close()
 
 
-def _pack(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
-    """A tree of dataclasses as JSON values; its large arrays go into `arrays` by name."""
-    if isinstance(value, np.ndarray):
-        if value.size > _INLINE:
-            name = next((known for known, array in arrays.items() if array is value), name)
-            arrays[name] = value
-            return {_FILE: name}
-        return {_ARRAY: [value.dtype.str, value.shape, _pack(value.ravel().tolist(), name, arrays)]}
+def _pack(large: dict[int, NDArray[Any]], value: Any) -> Any:
+    """What MessagePack does not know; large arrays go into `large`, once each."""
     if isinstance(value, em.Grid):  # always empty here
-        return {_GRID: [2 if isinstance(value, _core.OccupancyGrid2D) else 3, value.resolution]}
-    if dataclasses.is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {key: _pack(item, f"{name}.{key}", arrays) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_pack(item, f"{name}.{k}", arrays) for k, item in enumerate(value)]
-    is_special = isinstance(value, float) and not math.isfinite(value)
-    return str(value) if is_special else value
+        dimension = 2 if isinstance(value, _core.OccupancyGrid2D) else 3
+        return msgpack.Ext(_GRID, msgpack.encode([dimension, value.resolution]))
+    if not isinstance(value, np.ndarray):
+        return value.item()  # NumPy's numbers
+    if value.size <= _INLINE:
+        content = [value.dtype.str, value.shape, value.tobytes()]
+        return msgpack.Ext(_ARRAY, msgpack.encode(content))
+    large.setdefault(id(value), value)
+    return msgpack.Ext(_FILE, msgpack.encode([*large].index(id(value))))
 
 
-def _unpack(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
-    """The values that `_pack` was given, as far as JSON has them."""
-    if isinstance(value, list):
-        return [_unpack(item, arrays) for item in value]
-    if not isinstance(value, dict):
-        return value
-    if _FILE in value:
-        return arrays[value[_FILE]]
-    if _ARRAY in value:
-        dtype, shape, content = value[_ARRAY]
-        return np.array(content, np.dtype(dtype)).reshape(shape)
-    if _GRID in value:
-        return em.make_grid(*value[_GRID])
-    return {key: _unpack(item, arrays) for key, item in value.items()}
+def _unpack(large: list[NDArray[Any]], code: int, packed: memoryview) -> Any:
+    """What `_pack` was given."""
+    content = msgpack.decode(packed)
+    if code == _FILE:
+        return large[content]
+    if code == _GRID:
+        return em.make_grid(*content)
+    dtype, shape, values = content
+    return np.ndarray(shape, np.dtype(dtype), bytearray(values))
 
 
 def identify_run(recording: Recording, options: Options, poses: Float | None) -> dict[str, Any]:
@@ -194,12 +181,12 @@ def identify_run(recording: Recording, options: Options, poses: Float | None) ->
     arrays = (*(getattr(recording, name) for name in names), recording.T_odom_base, poses)
     values = {one.name: to_jsonable(one.value) for one in iter_options(options)}
     matter = {name: value for name, value in values.items() if name not in _NO_MATTER}
-    return {"version": package_version(), **matter, "input": _digest(None, *arrays)}
+    return {"version": package_version(), **matter, "input": _digest(*arrays)}
 
 
-def _digest(values: Any, *arrays: NDArray[Any] | None) -> str:
-    """Of JSON values and of the types, shapes and values of arrays."""
-    digest = hashlib.blake2b(json.dumps(values).encode(), digest_size=16)
+def _digest(*arrays: NDArray[Any] | None) -> str:
+    """Of the types, shapes and values of arrays."""
+    digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
         digest.update(b"none" if array is None else f"{array.dtype.str} {array.shape}".encode())
         for part in () if array is None else iter_bytes(array):

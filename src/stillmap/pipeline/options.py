@@ -1,13 +1,11 @@
 """All options of a run, and their resolution for a recording."""
 
 import dataclasses
-from dataclasses import field
-from typing import Literal, Self
+import math
+from dataclasses import dataclass, field
+from typing import Literal
 
-from pydantic import model_validator
-from pydantic.dataclasses import dataclass
-
-from stillmap.core.config import STRICT, option
+from stillmap.core.config import CheckedOptions, option
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
@@ -19,8 +17,8 @@ from stillmap.tracking import ObjectOptions
 MapMode = Literal["trinary", "scale", "raw"]
 
 
-@dataclass(frozen=True, config=STRICT)
-class OutputOptions:
+@dataclass(frozen=True)
+class OutputOptions(CheckedOptions):
     """Options of the result folder."""
 
     map_mode: MapMode = option(
@@ -41,25 +39,23 @@ class OutputOptions:
         None,
         "Part of the map frame that is written: x0, y0, x1, y1 in metres; unset: everything. Poses "
         "and labels are of all scans.",
-        strict=False,  # TOML and JSON have lists
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def __post_init__(self) -> None:
         """Refuses an empty band of heights, and an empty region."""
+        super().__post_init__()
         x0, y0, x1, y1 = self.region or (0.0, 0.0, 1.0, 1.0)
-        if not (x0 < x1 and y0 < y1):
+        if not (-math.inf < x0 < x1 < math.inf and -math.inf < y0 < y1 < math.inf):
             corners = f"{x0:g} {y0:g} {x1:g} {y1:g}"
             what = "'output.region' must be x0 y0 x1 y1 with x0 < x1 and y0 < y1"
             raise ValueError(f"{what}, got {corners}")
         if not self.min_obstacle_height < self.max_obstacle_height:
             what = "'output.min_obstacle_height' must be less than 'output.max_obstacle_height'"
             raise ValueError(what)
-        return self
 
 
-@dataclass(frozen=True, config=STRICT)
-class Options:
+@dataclass(frozen=True)
+class Options(CheckedOptions):
     """All options of a run."""
 
     threads: int = option(

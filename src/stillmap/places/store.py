@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from annotated_types import Gt, Lt
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
@@ -39,7 +39,7 @@ _MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
 _TIES = ("first", "first_node", "second", "second_node")
 
-_Edge = Annotated[float, Gt(0.0), Lt(100.0)]
+_Edge = Annotated[float, Meta(gt=0.0, lt=100.0)]
 
 
 @dataclass(frozen=True)

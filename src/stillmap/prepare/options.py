@@ -1,12 +1,10 @@
 """Options of reading: the meaning of ranges, laser poses, cameras, and topics of a bag."""
 
 import math
-from typing import Any, Literal, NamedTuple, Self
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
-from pydantic import model_validator
-from pydantic.dataclasses import dataclass
-
-from stillmap.core.config import STRICT, option
+from stillmap.core.config import CheckedOptions, option
 from stillmap.core.errors import InputError
 
 # m: beyond the reach of any 2D laser; drivers write 1e10 or FLT_MAX for +inf
@@ -42,8 +40,8 @@ class LaserOptions(NamedTuple):
         return self.x, self.y, self.theta
 
 
-@dataclass(frozen=True, config=STRICT)
-class ReadOptions:
+@dataclass(frozen=True)
+class ReadOptions(CheckedOptions):
     """Options of `stillmap.read`."""
 
     min_range: float = option(
@@ -109,9 +107,9 @@ class ReadOptions:
     base_frame: str | None = option(None, f"Base frame of the robot in a bag; {_FOUND}")
     odom_frame: str | None = option(None, f"Odometry frame in a bag; {_FOUND}")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def __post_init__(self) -> None:
         """Checks that ranges lie above `min_range` and that names are not blank."""
+        super().__post_init__()
         for name in ("max_range", "free_range"):
             value = getattr(self, name)
             if value is not None and not value > self.min_range:
@@ -123,7 +121,6 @@ class ReadOptions:
             value = getattr(self, name)
             if value is not None and (not value.strip() or "\0" in value):
                 raise ValueError(f"'read.{name}' must not be blank, and hold no NUL")
-        return self
 
     def laser(self, number: int) -> LaserOptions:
         """Options of a laser, counted from 0; all unset from the third one on."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Le
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from stillmap.core import se2
@@ -46,7 +46,7 @@ _MAX_HITS = 1e30  # in a cell: single precision holds it
 _ROWS = 256  # of a map that are checked at a time
 _MAX_OBJECTS = 256 << 20  # bytes of an objects.json
 
-Stamp = Annotated[int, Ge(-(2**63)), Le(2**63 - 1)]
+Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class Grid(GridMap):
@@ -294,8 +294,8 @@ class _Positions:
 class _Object:
     """An entry of `objects.json`."""
 
-    id: Annotated[int, Ge(0), Le(2**31 - 1)]  # as messages of ROS hold it
-    size: tuple[float, float] | tuple[float, float, float]
+    id: Annotated[int, Meta(ge=0, le=2**31 - 1)]  # as messages of ROS hold it
+    size: Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
     track: _Positions
     beams: int | None = None
     p_dynamic: float | None = None
@@ -348,7 +348,7 @@ class _Run:
     """The entries of `run.json` that are read."""
 
     input: dict[str, Any]
-    options: dict[str, dict[str, Any] | Any] | None = None
+    options: dict[str, Any] | None = None
     warnings: list[str] | None = None
     quality: _Quality | None = None
     dimension: int | None = None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Le
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import parse, read_npz
@@ -19,7 +19,7 @@ from stillmap.results.reader import SESSIONS, Stamp
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Kind = Literal["appeared", "gone", "moved", "door"]
-Probability = Annotated[float, Ge(0.0), Le(1.0)]
+Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 CHANGES, STATES = "changes.json", "states.npz"
 HINT = "merge the sessions anew"
@@ -107,8 +107,8 @@ class _SessionEntry:
     overlap: Probability = 1.0
     first_stamp_ns: Stamp = 0
     last_stamp_ns: Stamp = 0
-    first_scan: Annotated[int, Ge(0), Le(2**40)] = 0
-    scans: Annotated[int, Ge(0), Le(2**40)] = 0
+    first_scan: Annotated[int, Meta(ge=0, le=2**40)] = 0
+    scans: Annotated[int, Meta(ge=0, le=2**40)] = 0
 
 
 def read_sessions(folder: Path) -> list[PlaceSession]:

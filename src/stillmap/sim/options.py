@@ -1,21 +1,21 @@
 """Parameters of a scene: sensors, robot, odometry, people, doors, vehicles, ground and heights."""
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
+from msgspec import Meta
 
-from stillmap.core.config import STRICT, Count, option
+from stillmap.core.config import CheckedOptions, Count, option
 
 Shape = Literal["legs", "bodies", "mixed"]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 
 _TURN = 2 * math.pi + 1e-9
 MAX_ELEVATION = math.radians(85.0)
-Elevation = Annotated[float, Field(ge=-MAX_ELEVATION, le=MAX_ELEVATION)]
+Elevation = Annotated[float, Meta(ge=-MAX_ELEVATION, le=MAX_ELEVATION)]
 _MAX_CAMERA_FOV = math.radians(150.0)
 
 # degrees, elevations of the lowest and highest channel of common sensors, by number of channels
@@ -28,8 +28,8 @@ def require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
-@dataclass(frozen=True, config=STRICT)
-class CrowdOptions:
+@dataclass(frozen=True)
+class CrowdOptions(CheckedOptions):
     """The people."""
 
     people: Count = option(15, "Number of people.", ge=0)
@@ -41,8 +41,8 @@ class CrowdOptions:
     max_stop: NotNegative = option(20.0, "Maximum duration of a stop, s.")
 
 
-@dataclass(frozen=True, config=STRICT)
-class DoorOptions:
+@dataclass(frozen=True)
+class DoorOptions(CheckedOptions):
     """Durations of the states of doors, log-uniformly distributed."""
 
     min_open: Positive = option(4.0, "Minimum time a door stays open, s.")
@@ -52,8 +52,8 @@ class DoorOptions:
     swing: Positive = option(1.5, "Time from closed to open, s.")
 
 
-@dataclass(frozen=True, config=STRICT)
-class TrafficOptions:
+@dataclass(frozen=True)
+class TrafficOptions(CheckedOptions):
     """The vehicles on the lanes of a scene, besides queues."""
 
     vehicles: Count = option(10, "Number of vehicles, spread over the lanes.", ge=0)
@@ -63,8 +63,8 @@ class TrafficOptions:
     max_stop: float = option(12.0, "Maximum duration of a stop, s.", ge=3)
 
 
-@dataclass(frozen=True, config=STRICT)
-class LaserOptions:
+@dataclass(frozen=True)
+class LaserOptions(CheckedOptions):
     """The planar laser scanner and its pose on the robot."""
 
     beams: Count = option(180, "Beams per scan.", ge=2)
@@ -105,8 +105,8 @@ class LaserOptions:
         return 2 if self.second_laser else 1
 
 
-@dataclass(frozen=True, config=STRICT)
-class RobotOptions:
+@dataclass(frozen=True)
+class RobotOptions(CheckedOptions):
     """Motion of the robot, scan rate, and mishaps."""
 
     speed: Positive = option(0.5, "Speed on a free way, m/s.")
@@ -130,8 +130,8 @@ class RobotOptions:
     stamp_rounding: NotNegative = option(0.0, "Resolution of stamps, s; 0: nanoseconds.")
 
 
-@dataclass(frozen=True, config=STRICT)
-class OdometryOptions:
+@dataclass(frozen=True)
+class OdometryOptions(CheckedOptions):
     """Errors of differential-drive odometry; all 0: perfect odometry."""
 
     wheel_radius_error: NotNegative = option(0.0005, "Relative error of each wheel radius (sigma).")
@@ -151,8 +151,8 @@ class OdometryOptions:
     latency: NotNegative = option(0.0, "Age of odometry at its stamp, s.")
 
 
-@dataclass(frozen=True, config=STRICT)
-class CameraOptions:
+@dataclass(frozen=True)
+class CameraOptions(CheckedOptions):
     """Identical cameras on the robot with a global shutter."""
 
     enabled: bool = option(False, "Add cameras.")
@@ -170,8 +170,8 @@ class CameraOptions:
     exposure: NotNegative = option(0.0, "Standard deviation of the relative exposure of images.")
 
 
-@dataclass(frozen=True, config=STRICT)
-class LidarOptions:
+@dataclass(frozen=True)
+class LidarOptions(CheckedOptions):
     """A spinning lidar, which replaces the planar laser, and its pose on the robot."""
 
     channels: Count = option(0, "Number of channels; 0: no lidar.", ge=0)
@@ -205,8 +205,8 @@ class LidarOptions:
         return (low if self.low is None else self.low, high if self.high is None else self.high)
 
 
-@dataclass(frozen=True, config=STRICT)
-class RigOptions:
+@dataclass(frozen=True)
+class RigOptions(CheckedOptions):
     """Two lasers like `laser`: one horizontal, one tilting about the robot's y axis."""
 
     tilts: bool = option(False, "There are two lasers, one of which tilts.")
@@ -218,8 +218,8 @@ class RigOptions:
     period: Positive = option(4.0, "Period of the tilting at constant rate, s.")
 
 
-@dataclass(frozen=True, config=STRICT)
-class GroundOptions:
+@dataclass(frozen=True)
+class GroundOptions(CheckedOptions):
     """The ground: a plane, with pavements above it."""
 
     slope_x: float = option(0.0, "Slope to the east at the origin, m/m.", ge=-0.3, le=0.3)
@@ -227,8 +227,8 @@ class GroundOptions:
     kerb: float = option(0.12, "Height of pavements above the street, m.", ge=0, le=0.5)
 
 
-@dataclass(frozen=True, config=STRICT)
-class HeightOptions:
+@dataclass(frozen=True)
+class HeightOptions(CheckedOptions):
     """Heights of ceiling, walls, doors and furniture."""
 
     ceiling: Positive | None = option(2.8, "Height of the ceiling, m; unset: open sky.")

@@ -1,14 +1,12 @@
 """Options of the M-step over poses and map."""
 
-from dataclasses import field
+from dataclasses import dataclass, field
 
-from pydantic.dataclasses import dataclass
-
-from stillmap.core.config import STRICT, option
+from stillmap.core.config import CheckedOptions, option
 
 
-@dataclass(frozen=True, config=STRICT)
-class OdometryOptions:
+@dataclass(frozen=True)
+class OdometryOptions(CheckedOptions):
     """Noise of wheel odometry."""
 
     translation_per_metre: float = option(
@@ -25,8 +23,8 @@ class OdometryOptions:
     )
 
 
-@dataclass(frozen=True, config=STRICT)
-class SlamOptions:
+@dataclass(frozen=True)
+class SlamOptions(CheckedOptions):
     """Poses and map."""
 
     resolution: float = option(0.05, "Edge of a map cell, in metres.", ge=0.005, le=10)

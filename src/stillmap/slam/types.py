@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import stillmap._core as _core
 from stillmap.core.array_types import Float, Float32, Index
@@ -13,6 +13,10 @@ from stillmap.slam import scan_hits
 from stillmap.slam.pose_graph import PoseGraph
 from stillmap.slam.scan_hits import Scan
 
+if TYPE_CHECKING:
+    Grid = _core.OccupancyGrid2D | _core.OccupancyGrid3D
+else:
+    Grid = Any  # msgspec, which reads checkpoints, knows no union of two such classes
 ScanProgress = Callable[[int, int], None]  # scans done, total
 
 
@@ -117,7 +121,7 @@ class MStepResult(ShortRepr):
 
     poses: Float
     covariance: Float
-    grid: _core.OccupancyGrid2D | _core.OccupancyGrid3D
+    grid: Grid
     explained: Float
     drift: Float | None = None
     diagnostics: Diagnostics = field(default_factory=Diagnostics)

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-import pydantic
 
 from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Float32, Index, Int64
-from stillmap.core.config import STRICT, option
+from stillmap.core.config import CheckedOptions, option
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks
@@ -35,8 +34,8 @@ _VEHICLE_ACCELERATION = 4.0  # m2/s3
 _OUTLIERS = 5.0  # percent of the points on either side outside the box: legs swing
 
 
-@pydantic.dataclasses.dataclass(frozen=True, config=STRICT)
-class ObjectOptions:
+@dataclass(frozen=True)
+class ObjectOptions(CheckedOptions):
     """Tracking of moving objects; see `docs/objects.md`."""
 
     enabled: bool = option(True, "Detect and track moving objects.")

@@ -3,18 +3,17 @@
 Names and meanings of parameters are those of slam_toolbox and nav2.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from stillmap.core.array_types import Bool, Float, Float32
-from stillmap.core.config import STRICT, declared_fields, option, override
+from stillmap.core.config import CheckedOptions, declared_options, option, override
 from stillmap.io.ros.clouds import parse_cloud
 from stillmap.io.ros.lasers import ScanShape
 from stillmap.io.ros.messages import stamp_ns
@@ -32,19 +31,18 @@ def _to_tuple(values: Any) -> tuple[Any, ...]:
     return (values,) if isinstance(values, str | float | int) else tuple(values or ())
 
 
-_Name = Annotated[str, Field(min_length=1)]
-_Names = Annotated[tuple[_Name, ...], BeforeValidator(_to_tuple)]
-_Numbers = Annotated[tuple[float, ...], BeforeValidator(_to_tuple)]
+_Name = Annotated[str, Meta(min_length=1)]
+_Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
 
-@dataclass(frozen=True, config=STRICT)
-class Parameters:
+@dataclass(frozen=True)
+class Parameters(CheckedOptions):
     """ROS parameters of the node."""
 
-    scan_topic: _Names = option(
-        ("scan",), "LaserScan topics: one name, or several", min_length=1, validate_default=True
+    scan_topic: tuple[_Name, ...] = option(
+        ("scan",), "LaserScan topics: one name, or several", min_length=1
     )
-    cloud_topic: _Names = option(
+    cloud_topic: tuple[_Name, ...] = option(
         (), "PointCloud2 topics: one name, or several; where there are any, scan_topic is not read"
     )
     odom_topic: str = option("odom", "Odometry topic, used where TF has no odometry")
@@ -52,7 +50,7 @@ class Parameters:
     map_frame: _Name = option("map", "frame of the map")
     odom_frame: str = option("odom", "frame of the odometry; empty: there is none")
     base_frame: _Name = option("base_footprint", "frame of the robot")
-    laser_pose: _Numbers = option(
+    laser_pose: tuple[_Number, ...] = option(
         (),
         "x, y, yaw (m, rad) of each laser on the robot; x, y, z, roll, pitch, yaw of each topic of "
         "clouds; empty: from /tf_static",
@@ -73,12 +71,11 @@ class Parameters:
     )
     tf_buffer_duration: float = option(30.0, "s that transforms are kept", gt=0)
 
-    @model_validator(mode="after")
-    def _check_laser_pose(self) -> "Parameters":
+    def __post_init__(self) -> None:
+        super().__post_init__()
         n = len(self.topics) * (3 if self.dimension == 2 else 6)
         if len(self.laser_pose) not in (0, n):
             raise ValueError(f"'laser_pose' must be {n} numbers, got {self.laser_pose}")
-        return self
 
     @property
     def dimension(self) -> int:
@@ -101,13 +98,14 @@ def declare(declare_one: Callable[[str, Any, str], Any], **defaults: Any) -> Par
     Raises:
         InputError: a value is of the wrong type, or out of range.
     """
-    fields, values = declared_fields(Parameters), {}
-    for field in dataclasses.fields(Parameters):
-        default = defaults.get(field.name, getattr(Parameters(), field.name))
+    values = {}
+    for name, declared in declared_options(Parameters).items():
+        default = defaults.get(name, declared.default)
         if isinstance(default, tuple):  # ROS knows lists; one name is plain
             default = default[0] if len(default) == 1 else list(default)
-        meaning = fields[field.name].description
-        values[field.name] = declare_one(field.name, default, meaning or "")
+        value = declare_one(name, default, declared.doc)
+        is_tuple = isinstance(declared.default, tuple)
+        values[name] = _to_tuple(value) if is_tuple else value
     return override(Parameters(), values, "parameters")
 
 

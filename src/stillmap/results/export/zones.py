@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from annotated_types import Ge, Le, MinLen
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import parse
@@ -23,9 +23,9 @@ Polygon = list[Float]  # rings (n, 2), the last position equal to the first: out
 
 _MAX_BYTES = 16 << 20
 _MIN_PERCENT, _MIN_SPEED, _MAX_SPEED = 1.0, 0.01, 100.0  # m/s
-_Axis = Annotated[float, Ge(-1e9), Le(1e9)]  # m
-_Ring = Annotated[list[Annotated[list[_Axis], MinLen(2)]], MinLen(4)]
-_Polygons = Annotated[list[Annotated[list[_Ring], MinLen(1)]], MinLen(1)]
+_Axis = Annotated[float, Meta(ge=-1e9, le=1e9)]  # m
+_Ring = Annotated[list[Annotated[list[_Axis], Meta(min_length=2)]], Meta(min_length=4)]
+_Polygons = Annotated[list[Annotated[list[_Ring], Meta(min_length=1)]], Meta(min_length=1)]
 
 
 class SpeedLimit(NamedTuple):

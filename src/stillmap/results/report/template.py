@@ -74,7 +74,7 @@ def format_share(share: float) -> str:
 
 def format_duration(seconds: float) -> str:
     """Seconds as ms, s, min or h."""
-    if 0 < seconds < 0.1:
+    if 0 < seconds < 0.0995:  # more would be 1e+02 ms
         return f"{1e3 * seconds:.2g} ms"
     if seconds < 10:
         return f"{seconds:.2g} s"

@@ -12,7 +12,7 @@ from functools import partial
 from importlib import resources
 from typing import Any, get_type_hints
 
-from pydantic import TypeAdapter
+import msgspec
 
 from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
@@ -39,7 +39,7 @@ def load_world(name: str) -> Scene:
             part[key] = [
                 segment for kind, *values in part[key] for segment in PIECES[kind](*values)
             ]
-    values = {key: TypeAdapter(_TYPES[key]).validate_python(rows) for key, rows in tree.items()}
+    values = {key: msgspec.convert(rows, _TYPES[key]) for key, rows in tree.items()}
     values["name"] = name
     scene = Scene(**values) if base is None else dataclasses.replace(load_world(base), **values)
     walls = (wall for wall in scene.walls if not any(_is_within(wall, *area) for area in cleared))
