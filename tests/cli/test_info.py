@@ -178,10 +178,12 @@ def test_poses_and_images(path, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "-0.05, 0.1\n" in out
     assert re.search("recorded_poses +path_length_m 7, turned_deg 0", out)
-    assert re.search("count +5\n +usable +0\n +left out +of a 2D recording 5", out)
-    words = "name front, count 3, usable 0, width 8, height 6, calibrated yes, placed yes"
+    assert re.search("count +5\n +usable +0\n +left_out +of a 2D recording 5", out)
+    words = "name front, count 3, usable 0, width 8, height 6, calibrated True, placed True"
     assert words in out
-    assert "name rear, count 2, usable 0, width 80, height 60, calibrated no, placed no" in out
+    assert (
+        "name rear, count 2, usable 0, width 80, height 60, calibrated False, placed False" in out
+    )
     run(tmp_path / "rec", "--json")
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)

@@ -11,19 +11,10 @@ from stillmap.core.files import require_new, require_new_file, workplace
 from stillmap.core.grid_map import limit_hits
 from stillmap.io import writers
 from stillmap.io.ros.messages import BagKind
-from stillmap.results import point_cloud, tables
+from stillmap.results import point_cloud, reader, tables
 from stillmap.results.export import bag, nav2, point_cloud_files, zones
 from stillmap.results.folder import ResultFolder, open_result
 from stillmap.results.mapped_place import MappedPlace
-from stillmap.results.reader import (
-    EXTENDS,
-    TILTING,
-    is_place,
-    read_colors,
-    read_crossings,
-    read_grid,
-    read_run,
-)
 from stillmap.slam import deskew_recording
 
 NAV2 = "nav2"  # the format of maps and masks
@@ -43,8 +34,8 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
     if flag_changes(args):
         text = "a result's recording is read as it was for the map: no flags for reading it"
         raise InputError(text, where=str(source))
-    is_whole = is_place(source)  # what a place has as a whole needs none of its recordings
-    place = ResultFolder(source, read_run(source)) if is_whole else None
+    is_whole = reader.is_place(source)  # what a place has as a whole needs none of its recordings
+    place = ResultFolder(source, reader.read_run(source)) if is_whole else None
     result = place or open_result(source, args.input)
     for path in result.sources or (source,):
         require_apart(output, path, source)
@@ -76,8 +67,8 @@ def _convert_to_nav2(
     rule = _traffic_rule(args)
     drawn = zones.read_zones(Path(args.mask)) if args.mask is not None else []
     is_traffic = rule.keepout is not None or rule.slow is not None
-    crossings = read_crossings(result.folder) if is_traffic else None
-    maps = nav2.make_maps(read_grid(result.folder), drawn, rule, crossings)
+    crossings = reader.read_crossings(result.folder) if is_traffic else None
+    maps = nav2.make_maps(reader.read_grid(result.folder), drawn, rule, crossings)
     nav2.write(maps, output, result.output_options.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
@@ -145,8 +136,8 @@ def _convert_to_cloud(
 ) -> str:
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
-    is_whole = isinstance(result.record.get(TILTING), dict) or is_place(result.folder)
-    if is_whole or result.record["input"].get(EXTENDS) is True:  # no recording has all of it
+    is_whole = isinstance(result.record.get(reader.TILTING), dict) or reader.is_place(result.folder)
+    if is_whole or result.record["input"].get(reader.EXTENDS) is True:  # no recording has all of it
         points = point_cloud.cloud_from_folder(result.folder, args.only)
     else:
         points = _build_cloud(args, result, workplace(output))
@@ -168,7 +159,7 @@ def _build_cloud(
         )
     poses = result.read_poses(recording)
     deskewed = deskew_recording(recording, poses, result.slam_options)
-    colors = read_colors(result.folder, recording.n_beams)
+    colors = reader.read_colors(result.folder, recording.n_beams)
     deskewed = limit_hits(deskewed, poses, result.output_options.region)
     return point_cloud.cloud_from_recording(
         recording,

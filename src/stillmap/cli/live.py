@@ -9,17 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import (
-    NO_ODOMETRY,
-    OTHERS,
-    OVERWRITE,
-    PLACE_MAP,
-    READ,
-    RUN,
-    make_parents,
-    options_from_args,
-    require_apart,
-)
+from stillmap.cli import arguments
 from stillmap.cli.console import print_json, say, show_progress, show_share
 from stillmap.core.errors import InputError, import_extra
 
@@ -49,7 +39,7 @@ EPILOG = """examples:
 FLAGS = f"""
 --replay INPUT  a recording (default: a ROS 2 node that maps until Ctrl-C)
 -o --output DIR!  result folder
-{OVERWRITE}
+{arguments.OVERWRITE}
 --rate X  push scans at X times the speed of the recording, loops closed beside; a scan that is due
   while earlier ones wait is dropped (default: one after another, the same to the bit every time)
 --map DIR  a result or a place in whose map the robot is localized (default: map anew)
@@ -60,7 +50,7 @@ FLAGS = f"""
   WebSocket; needs the extra `live`
 --host ADDRESS  where --foxglove listens; who reaches it can watch (default: 127.0.0.1)
 --port N  port of --foxglove; 0: a free one (default: 8765)
-{NO_ODOMETRY}{PLACE_MAP}{RUN}{READ}{OTHERS}"""
+{arguments.NO_ODOMETRY}{arguments.PLACE_MAP}{arguments.RUN}{arguments.READ}{arguments.OTHERS}"""
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -80,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.live.history import FOLDER
     from stillmap.live.saving import require_place_for_drive
 
-    options = options_from_args(args)
+    options = arguments.options_from_args(args)
     output, limit = Path(args.output), args.max_scratch
     if args.rate is not None and not args.rate > 0.0:
         raise InputError(f"--rate: expected a positive number, got {args.rate:g}")
@@ -88,11 +78,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--max-scratch: expected at least 0.0001 GB, got {limit:g}")
     require_place_for_drive(output, args.overwrite)
     if args.replay is not None:
-        require_apart(output, Path(args.replay))
+        arguments.require_apart(output, Path(args.replay))
     elif args.no_odometry or args.json or args.rate is not None:
         raise InputError("--no-odometry, --rate and --json are for --replay")
     with (
-        make_parents(output),
+        arguments.make_parents(output),
         tempfile.TemporaryDirectory(prefix="stillmap-") as scratch,
         _serve(args) as show,
     ):

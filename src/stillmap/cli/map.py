@@ -7,15 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.arguments import (
-    METHOD,
-    OTHERS,
-    OVERWRITE,
-    READ,
-    RUN,
-    options_from_args,
-    require_apart,
-)
+from stillmap.cli import arguments
 from stillmap.cli.console import print_json, say, show_progress
 from stillmap.core.errors import InputError, is_out_of_memory, memory_error
 
@@ -48,9 +40,9 @@ input INPUT+  a CARMEN log, a ROS bag, a stillmap recording folder, ...; several
   planar laser, decides what moves
 --tilting-topic -> read.tilting_topic
 -o --output DIR!  result folder
-{OVERWRITE}
+{arguments.OVERWRITE}
 --resume  continue an interrupted run from its last checkpoint
-{RUN}{METHOD}{READ}{OTHERS}"""
+{arguments.RUN}{arguments.METHOD}{arguments.READ}{arguments.OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.pipeline.checkpoint import lock_checkpoints
     from stillmap.results.writer import save
 
-    options = options_from_args(args)
+    options = arguments.options_from_args(args)
     output, stages = Path(args.output), StageTimer()
     _require_usable_output(args, output)
     with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
@@ -88,7 +80,7 @@ def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
 
     require_new(output, RECORD, args.overwrite or args.resume)
     for source in filter(None, (*args.input, args.tilting)):
-        require_apart(output, Path(source))
+        arguments.require_apart(output, Path(source))
 
 
 def _require_own_result(args: argparse.Namespace, output: Path, recording: "Recording") -> None:

@@ -4,17 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import (
-    NO_ODOMETRY,
-    OTHERS,
-    OVERWRITE,
-    PLACE_MAP,
-    READ,
-    RUN,
-    make_parents,
-    options_from_args,
-    require_apart,
-)
+from stillmap.cli import arguments
 from stillmap.cli.console import list_files, print_json, say, show_progress
 from stillmap.core.errors import InputError
 
@@ -42,11 +32,11 @@ exit status 2 where fewer than two sessions could be placed
 FLAGS = f"""
 input SESSION+  a recording, a result folder, or first a place
 -o --output PLACE!  folder of the place
-{OVERWRITE}
+{arguments.OVERWRITE}
 --frame NAME  session whose frame the place has (default: the first one, or as it was)
 --map-state STATE = last  state of what changed that the map shows: last, majority, the name of a
   session, or a date such as 2026-05-31
-{PLACE_MAP}{NO_ODOMETRY}{RUN}{READ}{OTHERS}"""
+{arguments.PLACE_MAP}{arguments.NO_ODOMETRY}{arguments.RUN}{arguments.READ}{arguments.OTHERS}"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,19 +51,19 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.results.reader import RECORD, is_place
     from stillmap.results.timeline import read_sessions
 
-    options, output = options_from_args(args), Path(args.output)
+    options, output = arguments.options_from_args(args), Path(args.output)
     base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
     paths = args.input if base is None else args.input[1:]
     if not paths:
         raise InputError("names no session to add", where=args.input[0])
     require_new(output, RECORD, args.overwrite)
     for path in args.input:
-        require_apart(output, Path(path))
+        arguments.require_apart(output, Path(path))
     taken = [] if base is None else [session.name for session in read_sessions(base)]
     sessions = list_sessions([[path] for path in paths], taken)
     job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
     with (
-        make_parents(output),
+        arguments.make_parents(output),
         show_progress(args.quiet, options.em.max_iterations) as progress,
     ):
         result = merge_sessions(job, output, args.overwrite, progress)

@@ -103,35 +103,23 @@ def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
 @contextmanager
 def _show_bar() -> Iterator[Show]:
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
-    from rich.table import Column
 
-    columns = (
-        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
-        BarColumn(bar_width=None),
-        TextColumn("{task.fields[counted]}", table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
-    )
+    columns = "{task.description}", BarColumn(None), "{task.fields[counted]}", TimeRemainingColumn()
     bar = Bar(*columns, console=Console(stderr=True), transient=True, expand=True)
-    shown = ""
+    task, shown = bar.add_task("", counted=""), ""
 
     def update(step: str, done: float, total: float, unit: str = "") -> None:  # noqa: ARG001
         nonlocal shown
         bar.start()  # not before the first progress
         if step != shown:
-            for task in bar.task_ids:
-                bar.remove_task(task)
-            bar.add_task(step, total=total or None, counted="")
+            bar.reset(task, description=step, total=total or None)
             shown = step
         counted = f"{100.0 * done:.0f} %" if isinstance(done, float) else f"{done}/{total}"
         # a finished step is shown even if it was short
-        bar.update(
-            bar.task_ids[0],
-            completed=done,
-            counted=counted if total else "",
-            refresh=done == total,
-        )
+        text = counted if total else ""
+        bar.update(task, completed=done, counted=text, refresh=done == total)
 
     try:
         yield update

@@ -13,15 +13,9 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
 from stillmap.pipeline.options import Options
+from stillmap.prepare import plausibility
 from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.lasers import mirror_beams
-from stillmap.prepare.plausibility import (
-    interpolate_late_odometry,
-    leave_out_far_returns,
-    leave_out_far_scans,
-    remove_leaps,
-    stated_max_range,
-)
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
 from stillmap.slam.mount_calibration import (
     LATENCY,
@@ -47,12 +41,12 @@ def correct_recording(
         sentence for everything that was changed.
     """
     cell, calibration = options.slam.resolution, Calibration()
-    recording, notes = remove_leaps(recording)
+    recording, notes = plausibility.remove_leaps(recording)
     if poses is not None:
-        recording, more = leave_out_far_scans(recording, poses, cell)
+        recording, more = plausibility.leave_out_far_scans(recording, poses, cell)
         notes += more
-    max_range = options.read.max_range or stated_max_range(recording)
-    recording, more = leave_out_far_returns(recording, cell, max_range)
+    max_range = options.read.max_range or plausibility.stated_max_range(recording)
+    recording, more = plausibility.leave_out_far_returns(recording, cell, max_range)
     notes += more
     recording, options, more = time_sweeps(recording, options)
     notes += more
@@ -128,7 +122,9 @@ def _interpolate_late_odometry(recording: Recording) -> tuple[Recording, list[st
     """The recording with late odometry interpolated, and a sentence about it; 2D only."""
     if recording.T_odom_base is None or recording.dimension != 2:
         return recording, []
-    T_odom_base, late = interpolate_late_odometry(recording.stamp_ns, recording.T_odom_base)
+    T_odom_base, late = plausibility.interpolate_late_odometry(
+        recording.stamp_ns, recording.T_odom_base
+    )
     if len(late) == 0:
         return recording, []
     sentence = (

@@ -7,27 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 import stillmap._core as _core
-from stillmap import em, slam
+from stillmap import em, mapping, slam
 from stillmap.core.array_types import Float, Index
 from stillmap.core.parallel import resolve_threads, trim_heap
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import GroundMap, estimate_ground
-from stillmap.mapping import (
-    Change,
-    Door,
-    MoverPoints,
-    detect_changes,
-    detect_changes_3d,
-    find_changed_object_beams,
-    find_doors,
-    find_lone_doors,
-    join_doors,
-    relabel_changes,
-    relabel_lone_doors,
-    update_occupancy,
-)
 from stillmap.mapping.lone_leaves import find_leaf_lines
 from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
@@ -72,8 +58,8 @@ class FinalEstimate(NamedTuple):
 
     deskewed: Recording
     estimate: Estimate
-    changes: list[Change]
-    doors: list[Door]
+    changes: list[mapping.Change]
+    doors: list[mapping.Door]
 
 
 def final_estimate(recording: Recording, best: Estimate, options: Options) -> FinalEstimate:
@@ -83,7 +69,7 @@ def final_estimate(recording: Recording, best: Estimate, options: Options) -> Fi
     cell, look = options.slam.resolution, options.em.time_bin
     changed = best.e_step.changed_cells
     if changed is not None:  # 3D: every E-step knows of them
-        changes = detect_changes_3d(changed, deskewed, best.poses, cell, look)
+        changes = mapping.detect_changes_3d(changed, deskewed, best.poses, cell, look)
         return FinalEstimate(deskewed, best, changes, [])
     if recording.dimension == 3 or options.estimator != "stillmap":
         return FinalEstimate(deskewed, best, [], [])
@@ -97,14 +83,14 @@ def final_estimate(recording: Recording, best: Estimate, options: Options) -> Fi
     if courses is None:
         return FinalEstimate(deskewed, best, [], [])
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
-    changes = detect_changes(courses, deskewed, cell, look, movers)
+    changes = mapping.detect_changes(courses, deskewed, cell, look, movers)
     surface = courses.cells[courses.p_in_map("majority") > 0.5]
     lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
-    every = detect_changes(courses, deskewed, cell, look)  # of dynamic hits, too
-    found_doors = find_doors(every, lines, surface, deskewed, best.poses, cell)
-    changes = join_doors(changes, found_doors)
+    every = mapping.detect_changes(courses, deskewed, cell, look)  # of dynamic hits, too
+    found_doors = mapping.find_doors(every, lines, surface, deskewed, best.poses, cell)
+    changes = mapping.join_doors(changes, found_doors)
     swung = [one.door for one in changes if one.door is not None]
-    lone = find_lone_doors(surface, swung, deskewed, best.poses, cell, threads)
+    lone = mapping.find_lone_doors(surface, swung, deskewed, best.poses, cell, threads)
     best = _relabel(deskewed, best, courses, changes, lone, options, threads)
     return FinalEstimate(deskewed, best, changes, [*swung, *lone])
 
@@ -113,18 +99,18 @@ def _relabel(
     deskewed: Recording,
     best: Estimate,
     courses: em.CellHistories,
-    changes: list[Change],
-    lone_doors: list[Door],
+    changes: list[mapping.Change],
+    lone_doors: list[mapping.Door],
     options: Options,
     threads: int,
 ) -> Estimate:
     """The labels and cells of changed places and doors, in the state that the map shows."""
     p_static, occupied = best.p_static, best.e_step.known_cells
     state = options.output.map_state
-    p_static, occupied = relabel_changes(
+    p_static, occupied = mapping.relabel_changes(
         deskewed, best.poses, p_static, occupied, courses, changes, state, threads
     )
-    p_static, occupied = relabel_lone_doors(
+    p_static, occupied = mapping.relabel_lone_doors(
         deskewed, best.poses, p_static, occupied, courses, lone_doors, state, threads
     )
     learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
@@ -133,11 +119,11 @@ def _relabel(
 
 def _add_motion_evidence(
     deskewed: Recording, best: Estimate, courses: em.CellHistories, threads: int
-) -> tuple[Estimate, MoverPoints]:
+) -> tuple[Estimate, mapping.MoverPoints]:
     """Labels of beams and cells, given which tracks are movers; the end points on these."""
     noise_std = courses.surfel_map.noise_std
     p_static, movers = apply_motion_evidence(deskewed, best.poses, best.p_static, noise_std)
-    occupied = update_occupancy(
+    occupied = mapping.update_occupancy(
         deskewed, best.poses, best.p_static, p_static, courses, best.e_step.known_cells, threads
     )
     return best.with_labels(p_static=p_static, occupied=occupied), movers
@@ -232,7 +218,7 @@ def find_objects(final: FinalEstimate, maps: Maps, options: Options) -> list[Mov
         return track_objects_3d(deskewed, poses, p_static, maps.ground, options.objects, threads)
     objects = track_objects(deskewed, poses, p_static, options.objects)
     cell = maps.filtered.resolution
-    changed = find_changed_object_beams(deskewed, poses, p_static, changes, doors, cell)
+    changed = mapping.find_changed_object_beams(deskewed, poses, p_static, changes, doors, cell)
     moved = [one for one in objects if not _is_change(one, changed, deskewed)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 

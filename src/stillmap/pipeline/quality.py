@@ -161,46 +161,32 @@ def _round(value: float | None) -> float | None:
     return None if value is None else round(value, 1)
 
 
-# the sentence on overall is at most that of the lower part plus this: no good map with poor labels
+# the verdict on overall is at most that of the lower part plus this: no good map with poor labels
 _MAX_CONTRAST = 25.0
 
-_LOWEST = (80.0, 60.0, 40.0, 0.0)  # figure of each sentence
-_SENTENCES = {
-    "overall": (
-        "good",
-        "usable; see which part is lower",
-        "look at the map before it is used, first where the lower part points to",
-        "doubtful; see which part is low, the other one may be good",
-    ),
-    "labels": (
-        "a second estimate agrees about nearly all that moved",
-        "a second estimate agrees about most of what moved",
-        "a second estimate disagrees about much of what moved",
-        "a second estimate confirms little of what moved; usual where little moves",
-    ),
-    "geometry": (
-        "scans matched anew and surfaces observed again agree with the map",
-        "scans matched anew or surfaces observed again are off by centimetres in places",
-        "scans or surfaces are off in places, or the map has many small pieces",
-        "the map may be bent or double: scans or walls observed again lie elsewhere",
-    ),
+_VERDICTS = {
+    80.0: "good",
+    60.0: "usable",
+    40.0: "check the map before use",
+    0.0: "doubtful",
+}
+_MEANINGS = {
+    "overall": "both, of which geometry counts more",
+    "labels": "how far a second estimate agrees about what moved",
+    "geometry": "how far scans matched anew and surfaces observed again agree with the map",
 }
 
 
 def describe_quality(quality: Quality) -> dict[str, str]:
     """One line for each part, for readers who do not know how it is computed."""
     out = {}
-    for part, sentences in _SENTENCES.items():
-        value = judged = getattr(quality, part)
+    for part, meaning in _MEANINGS.items():
+        value = getattr(quality, part)
         if value is None:
-            is_still = part == "labels" and quality.geometry is not None
-            why = ", as hardly anything moves" if is_still else " from this recording"
-            out[part] = f"{part}: cannot be determined{why}"
+            out[part] = f"{part}: cannot be determined from this recording"
             continue
-        if part == "overall" and quality.labels is not None and quality.geometry is not None:
-            judged = min(value, min(quality.labels, quality.geometry) + _MAX_CONTRAST)
-        elif part == "overall":
-            sentences = _SENTENCES["geometry"]
-        which = next(k for k, lowest in enumerate(_LOWEST) if judged >= lowest)
-        out[part] = f"{part} {value:.0f} of 100: {sentences[which]}"
+        parts = [one for one in (quality.labels, quality.geometry) if one is not None]
+        judged = min(value, min(parts) + _MAX_CONTRAST) if part == "overall" else value
+        verdict = next(word for lowest, word in _VERDICTS.items() if judged >= lowest)
+        out[part] = f"{part} {value:.0f} of 100: {verdict} ({meaning})"
     return out

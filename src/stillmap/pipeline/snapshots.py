@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.core.square_box import bound_box
+from stillmap.core.square_box import find_busiest
 from stillmap.core.tiles import crop
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
 _MOST_POINTS = 50_000
-_MOST_SQUARES = 1 << 22  # in which points are counted; those far from most others are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,9 @@ def choose_window(
     points = points[_within(points, whole)]
     corner = (low + high) / 2
     if len(points):
-        corner = np.clip(_densest(points, low, size_m) - size_m / 2, low, high)
+        step = size_m / 8
+        busiest = find_busiest(np.floor((points - low) / step).astype(np.int64), 8)
+        corner = np.clip(low + (busiest + 0.5) * step - size_m / 2, low, high)
     # on the grid's own lines, so that every iteration shows the same cells
     corner = low + np.floor((corner - low) / resolution + 1e-6) * resolution
     (left, bottom), (right, top) = corner.tolist(), (corner + size).tolist()
@@ -116,19 +117,3 @@ def _within(points: Float | Float32, window: Window) -> Bool:
     x0, y0, x1, y1 = window
     x, y = points.T
     return np.asarray((x >= x0) & (x < x1) & (y >= y0) & (y < y1))
-
-
-def _densest(points: Float | Float32, low: Float, size: float) -> Float:
-    """(2,) middle of the square of edge `size` with most points, to an eighth of its edge."""
-    step = size / 8
-    index = np.floor((points - low) / step).astype(np.int64)
-    if float((index.max(axis=0) + 17.0).prod()) > _MOST_SQUARES:
-        box = bound_box(index, _MOST_SQUARES, _MOST_SQUARES)
-        low, index = low + box.low * step, index[box.contains(index)] - box.low
-    # eight empty rows and columns on either side: the square may hang over the edge
-    counts = np.zeros(index.max(axis=0) + 17)
-    np.add.at(counts, (index[:, 0] + 8, index[:, 1] + 8), 1)
-    total = np.pad(counts.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    squares = total[8:, 8:] - total[:-8, 8:] - total[8:, :-8] + total[:-8, :-8]
-    best = np.array(np.unravel_index(squares.argmax(), squares.shape))
-    return low + (best - 8 + 4) * step

@@ -5,21 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stillmap.sim.options import (
-    MAX_ELEVATION,
-    CameraOptions,
-    CrowdOptions,
-    DoorOptions,
-    GroundOptions,
-    HeightOptions,
-    LaserOptions,
-    LidarOptions,
-    OdometryOptions,
-    RigOptions,
-    RobotOptions,
-    TrafficOptions,
-    require,
-)
+from stillmap.sim import options
 
 Point = tuple[float, float]
 Segment = tuple[float, float, float, float]
@@ -106,7 +92,9 @@ class Stay:
     until: float | None = None
 
     def __post_init__(self) -> None:
-        require(self.until is None or self.until > self.since, "a stay must end after it began")
+        options.require(
+            self.until is None or self.until > self.since, "a stay must end after it began"
+        )
 
 
 @dataclass(frozen=True)
@@ -122,10 +110,12 @@ class Thing:
     stays: tuple[Stay, ...]
 
     def __post_init__(self) -> None:
-        require(len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays")
+        options.require(
+            len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays"
+        )
         for stay, later in itertools.pairwise(self.stays):
             in_order = stay.until is not None and stay.until <= later.since
-            require(in_order, "stays of a thing must come one after the other")
+            options.require(in_order, "stays of a thing must come one after the other")
 
 
 @dataclass(frozen=True)
@@ -158,40 +148,42 @@ class Scene:
     lanes: tuple[Lane, ...] = ()
     lights: tuple[Light, ...] = ()
     things: tuple[Thing, ...] = ()
-    crowd: CrowdOptions = field(default_factory=CrowdOptions)
-    doors: DoorOptions = field(default_factory=DoorOptions)
-    traffic: TrafficOptions = field(default_factory=TrafficOptions)
-    laser: LaserOptions = field(default_factory=LaserOptions)
-    robot: RobotOptions = field(default_factory=RobotOptions)
-    odometry: OdometryOptions = field(default_factory=OdometryOptions)
-    lidar: LidarOptions = field(default_factory=LidarOptions)
-    ground: GroundOptions = field(default_factory=GroundOptions)
-    heights: HeightOptions = field(default_factory=HeightOptions)
-    rig: RigOptions = field(default_factory=RigOptions)
-    camera: CameraOptions = field(default_factory=CameraOptions)
+    crowd: options.CrowdOptions = field(default_factory=options.CrowdOptions)
+    doors: options.DoorOptions = field(default_factory=options.DoorOptions)
+    traffic: options.TrafficOptions = field(default_factory=options.TrafficOptions)
+    laser: options.LaserOptions = field(default_factory=options.LaserOptions)
+    robot: options.RobotOptions = field(default_factory=options.RobotOptions)
+    odometry: options.OdometryOptions = field(default_factory=options.OdometryOptions)
+    lidar: options.LidarOptions = field(default_factory=options.LidarOptions)
+    ground: options.GroundOptions = field(default_factory=options.GroundOptions)
+    heights: options.HeightOptions = field(default_factory=options.HeightOptions)
+    rig: options.RigOptions = field(default_factory=options.RigOptions)
+    camera: options.CameraOptions = field(default_factory=options.CameraOptions)
     pavements: tuple[Segment, ...] = ()
     mirrors: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
-        require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")
-        require(len(self.route) > 0, "a scene needs a route")
+        options.require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")
+        options.require(len(self.route) > 0, "a scene needs a route")
         sweep_share = self.laser.sweep_time * self.robot.scan_rate
-        require(sweep_share <= 1 + 1e-9, "sweep_time must not exceed the scan period")
+        options.require(sweep_share <= 1 + 1e-9, "sweep_time must not exceed the scan period")
         if self.rig.tilts:
-            require(not self.lidar.channels, "a rig of two lasers has no lidar")
+            options.require(not self.lidar.channels, "a rig of two lasers has no lidar")
             usual = not self.laser.second_laser and self.laser.upside_down == "no"
-            require(usual, "a rig has one upright horizontal laser")
+            options.require(usual, "a rig has one upright horizontal laser")
         angle = abs(self.rig.middle) + self.rig.amplitude
-        require(angle <= MAX_ELEVATION, "the laser must not tilt by more than 85 degrees")
+        options.require(
+            angle <= options.MAX_ELEVATION, "the laser must not tilt by more than 85 degrees"
+        )
         lowest, highest = self.lidar.field
-        require(lowest <= highest, "elevations must satisfy low <= high")
+        options.require(lowest <= highest, "elevations must satisfy low <= high")
         can_see = self.in_3d or not self.camera.enabled
-        require(can_see, "cameras need a 3D world: a lidar, or a tilting laser")
+        options.require(can_see, "cameras need a 3D world: a lidar, or a tilting laser")
         for section in (self.crowd, self.doors, self.traffic):
             for low in [name for name in vars(section) if name.startswith("min_")]:
                 high = low.replace("min_", "max_")
                 is_ordered = getattr(section, low) <= getattr(section, high)
-                require(is_ordered, f"{low} must not exceed {high}")
+                options.require(is_ordered, f"{low} must not exceed {high}")
 
     @property
     def in_3d(self) -> bool:

@@ -10,17 +10,6 @@ from stillmap.core.array_types import Float
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
-from stillmap.sim.geometry import (
-    BOX,
-    Faces,
-    Ground,
-    MovingSurfaces,
-    Part,
-    Solids,
-    StaticSurfaces,
-    assemble,
-    make_pose,
-)
 from stillmap.sim.options import HeightOptions, LidarOptions
 from stillmap.sim.scene import Scene, Segment
 from stillmap.sim.walls import polyline
@@ -41,7 +30,7 @@ class Loop(NamedTuple):
     sides: int
 
 
-def make_static_world(scene: Scene, ground: Ground) -> StaticSurfaces:
+def make_static_world(scene: Scene, ground: geometry.Ground) -> geometry.StaticSurfaces:
     """Walls, lintels and kerbs as faces; columns, furniture, trees and parked cars as solids."""
     loops, lines = trace_loops((*scene.walls, *scene.mirrors))
     top = scene.heights.top
@@ -53,14 +42,16 @@ def make_static_world(scene: Scene, ground: Ground) -> StaticSurfaces:
     ends = [*lines, *scene.glass, *lintels, *kerbs]
     is_glass = np.zeros(len(ends), bool)
     is_glass[len(lines) : len(lines) + len(scene.glass)] = True
-    faces = Faces(np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass)
+    faces = geometry.Faces(
+        np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass
+    )
     parts = [(k, -1, p) for k, loop in enumerate(loops) for p in make_parts(loop, scene.heights)]
     poses = np.reshape([loop[:3] for loop in loops], (1, -1, 3)).astype(float)
-    solids = assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
-    return StaticSurfaces(faces, solids, ground, scene.heights.ceiling)
+    solids = geometry.assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
+    return geometry.StaticSurfaces(faces, solids, ground, scene.heights.ceiling)
 
 
-def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
+def make_parts(loop: Loop, heights: HeightOptions) -> list[geometry.Part]:
     """3D parts of a closed outline, about its center and heading."""
     if loop.sides == 4:
         return geometry.make_box(loop.length, loop.width, heights)
@@ -135,7 +126,7 @@ class MoverSolids:
     """
 
     def __init__(
-        self, scene: Scene, motion: Motion, ground: Ground, rng: np.random.Generator
+        self, scene: Scene, motion: Motion, ground: geometry.Ground, rng: np.random.Generator
     ) -> None:
         self._motion, self._ground = motion, ground
         persons, Q = motion.kinds.count("person"), len(motion.people.mover)
@@ -144,7 +135,7 @@ class MoverSolids:
         solid = np.array([kind != "thing" for kind in motion.kinds[persons:]], bool)
         others[:, solid, 2] = np.unwrap(others[:, solid, 2], axis=0)
         self._others, self._is_thing = others, ~solid
-        parts: list[tuple[int, int, Part]] = []
+        parts: list[tuple[int, int, geometry.Part]] = []
         self.tall = np.zeros(len(motion.kinds))
         tall = _TALL[0] + _TALL[1] * rng.standard_normal(persons)
         self.tall[:persons] = np.minimum(tall, _MAX_TALL)
@@ -159,9 +150,9 @@ class MoverSolids:
             own = _parts_of(scene, motion, number, kind)
             parts += [(Q + number - persons, mover, part) for part in own]
             self.tall[number] = max(part.z[1] for part in own)
-        self._assembly = assemble(parts)
+        self._assembly = geometry.assemble(parts)
 
-    def at(self, moment: Moment, scan: int) -> Solids:
+    def at(self, moment: Moment, scan: int) -> geometry.Solids:
         """The solids at the n times of a moment within one scan."""
         people, others = self._motion.people, moment.interpolate(self._others)
         # movable objects jump from place to place
@@ -173,7 +164,7 @@ class MoverSolids:
         return self._assembly.at(poses, foot)
 
 
-def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part]:
+def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[geometry.Part]:
     """The parts of a door, vehicle or movable object."""
     length, width = motion.sizes[number].tolist()
     if kind == "door":
@@ -185,11 +176,11 @@ def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part
     for x0, y0, x1, y1 in lines:
         long, turn = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
         half, z = (long / 2, _THIN / 2), (0.0, scene.heights.furniture)
-        parts.append(Part(BOX, (x0 + x1) / 2, (y0 + y1) / 2, half, z, turn))
+        parts.append(geometry.Part(geometry.BOX, (x0 + x1) / 2, (y0 + y1) / 2, half, z, turn))
     return parts
 
 
-def _place_part(part: Part, loop: Loop) -> Part:
+def _place_part(part: geometry.Part, loop: Loop) -> geometry.Part:
     """A part of a loop, relative to the center of the whole object."""
     c, s = math.cos(loop.heading), math.sin(loop.heading)
     ahead = loop.x + c * part.ahead - s * part.aside
@@ -208,7 +199,7 @@ class World(NamedTuple):
     """
 
     episode: Episode
-    static: StaticSurfaces
+    static: geometry.StaticSurfaces
     movers: MoverSolids
     robot: Float
 
@@ -218,7 +209,7 @@ class World(NamedTuple):
         scene, rng = episode.scene, episode.body_rng
         slope = np.array((scene.ground.slope_x, scene.ground.slope_y))
         pavements = np.reshape(scene.pavements, (-1, 4)).astype(float)
-        ground = Ground(slope, pavements, scene.ground.kerb)
+        ground = geometry.Ground(slope, pavements, scene.ground.kerb)
         movers = MoverSolids(scene, episode.motion, ground, rng)
         robot = _shake(episode.motion.robot, ground, scene.lidar, rng)
         return cls(episode, make_static_world(scene, ground), movers, robot)
@@ -226,9 +217,9 @@ class World(NamedTuple):
     def T_world_base(self, moment: Moment) -> Float:
         """(N, 4, 4) pose of the robot at the times of a moment."""
         x, y, z, *angles = moment.interpolate(self.robot).T
-        return make_pose(np.stack([x, y, z], axis=-1), *angles)
+        return geometry.make_pose(np.stack([x, y, z], axis=-1), *angles)
 
-    def collect_surfaces(self) -> tuple[StaticSurfaces, MovingSurfaces]:
+    def collect_surfaces(self) -> tuple[geometry.StaticSurfaces, geometry.MovingSurfaces]:
         """The surfaces at the stamps of the scans; movers that never moved are static."""
         poses = []
         for scan in range(len(self.robot)):
@@ -239,10 +230,12 @@ class World(NamedTuple):
         moves = solids.mover >= 0
         never = solids._replace(pose=solids.pose[:1]).select(~moves)
         static = self.static._replace(solids=self.static.solids.concatenate(never))
-        return static, MovingSurfaces(self.episode.exact_ns, solids.select(moves))
+        return static, geometry.MovingSurfaces(self.episode.exact_ns, solids.select(moves))
 
 
-def _shake(robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator) -> Float:
+def _shake(
+    robot: Float, ground: geometry.Ground, o: LidarOptions, rng: np.random.Generator
+) -> Float:
     """(T, 6) x, y, z, roll, pitch, yaw of a robot (T, 3) on the ground, with vibration."""
     x, y, yaw = robot.T
     gx, gy = ground.slope
