@@ -1,21 +1,17 @@
-"""`stillmap config`: print every option."""
+"""Print every option with its default, meaning and range, as TOML for --config. Precedence:
+defaults < file of --config < --set < other flags.
 
-import argparse
-
-from stillmap.cli.arguments import OTHERS, options_from_args
-from stillmap.cli.console import print_json, print_lines
-
-DESCRIPTION = (
-    "Print every option with its default, meaning and range, as TOML for --config."
-    " Precedence: defaults < file of --config < --set < other flags."
-)
-EPILOG = """examples:
+examples:
   stillmap config                       every option
   stillmap config slam.odometry         one section
   stillmap config --set em.prior=0.8    with changes, as `stillmap map` would use them
   stillmap config > options.toml        to edit, for `stillmap map --config options.toml`
 """
 
+import argparse
+
+from stillmap.cli.arguments import OTHERS, options_from_args
+from stillmap.cli.console import print_json, print_lines
 
 FLAGS = f"""
 only NAME?  one section or option, e.g. slam.odometry

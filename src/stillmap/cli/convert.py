@@ -1,4 +1,18 @@
-"""`stillmap convert`: write a recording in another format, or a result for other programs."""
+"""Write a recording in another format, by the ending of FILE: .log, .clf, .txt, .log.gz, .clf.gz,
+.txt.gz, .bag, .db3, .mcap, .ply, .las, .laz; else a folder. A result of `stillmap map` becomes a
+bag (.mcap for Foxglove), in 2D a table of its beams (.parquet), in 3D a point cloud with
+p_static and colours (.las, .laz, .e57, .pcd, .ply, .xyz), or maps and masks for nav2. A place
+becomes maps and masks, in 3D also a cloud; its sessions, PLACE/sessions/NAME, all of this.
+
+examples:
+  stillmap convert log.clf.gz -o log.bag      for ROS 1
+  stillmap convert log.bag -o log --to ros2   a folder for ROS 2
+  stillmap convert log.bag -o part.bag --from 60 --until 120    a minute of it
+  stillmap convert out -o out.mcap            a result for Foxglove
+  stillmap convert out -o beams.parquet       every beam of a 2D result with its label
+  stillmap convert out -o static.laz --only static    static points of a 3D result
+  stillmap convert out -o maps --mask zones.geojson   edited map and masks for nav2
+"""
 
 import argparse
 from pathlib import Path
@@ -8,31 +22,8 @@ from stillmap.cli.console import say, show_share
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 
-# copies for the help: the modules that define them take long to load
-ENDINGS = (
-    *(".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
-    *(".bag", ".db3", ".mcap", ".ply", ".las", ".laz"),
-)
-CLOUDS = ".las, .laz, .e57, .pcd, .ply, .xyz"
+# a copy for the help: the modules that define them take long to load
 NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "ply", "las")
-
-DESCRIPTION = (
-    "Write a recording in another format, by the ending of FILE: "
-    f"{', '.join(ENDINGS)}; else a folder. A result of `stillmap map` becomes a bag (.mcap for "
-    "Foxglove), in 2D a table of its beams (.parquet), in 3D a point "
-    f"cloud with p_static and colours ({CLOUDS}), "
-    "or maps and masks for nav2. A place becomes maps and masks, in 3D also a "
-    "cloud; its sessions, PLACE/sessions/NAME, all of this."
-)
-EPILOG = """examples:
-  stillmap convert log.clf.gz -o log.bag      for ROS 1
-  stillmap convert log.bag -o log --to ros2   a folder for ROS 2
-  stillmap convert log.bag -o part.bag --from 60 --until 120    a minute of it
-  stillmap convert out -o out.mcap            a result for Foxglove
-  stillmap convert out -o beams.parquet       every beam of a 2D result with its label
-  stillmap convert out -o static.laz --only static    static points of a 3D result
-  stillmap convert out -o maps --mask zones.geojson   edited map and masks for nav2
-"""
 
 
 FLAGS = f"""

@@ -1,4 +1,14 @@
-"""`stillmap eval`: score trajectories, labels and maps, as text or as JSON."""
+"""Score a result, as text or with --json as one object on stdout. `relations` and `trajectory`
+compare poses with a reference; `labels` and `map` compare a result with the truth that `stillmap
+simulate` writes.
+
+examples:
+  stillmap eval relations out/trajectory.tum log.relations
+  stillmap eval relations out/trajectory.tum log.relations --odom log.clf.gz --json
+  stillmap eval trajectory out/trajectory.tum truth.tum --delta 10 --delta-unit frames
+  stillmap eval labels out sim
+  stillmap eval map out sim --reference out-empty --reference-truth sim-empty
+"""
 
 import argparse
 import math
@@ -9,19 +19,6 @@ from typing import Any, NamedTuple
 from stillmap.cli.arguments import add_flags
 from stillmap.cli.console import format_rows, print_json, print_lines
 from stillmap.core.errors import InputError
-
-DESCRIPTION = (
-    "Score a result, as text or with --json as one object on stdout. `relations` "
-    "and `trajectory` compare poses with a reference; `labels` and `map` compare a "
-    "result with the truth that `stillmap simulate` writes."
-)
-EPILOG = """examples:
-  stillmap eval relations out/trajectory.tum log.relations
-  stillmap eval relations out/trajectory.tum log.relations --odom log.clf.gz --json
-  stillmap eval trajectory out/trajectory.tum truth.tum --delta 10 --delta-unit frames
-  stillmap eval labels out sim
-  stillmap eval map out sim --reference out-empty --reference-truth sim-empty
-"""
 
 
 def _score_relations(args: argparse.Namespace) -> dict[str, Any]:

@@ -1,4 +1,18 @@
-"""`stillmap filter`: write a result's recording again with its dynamic beams blanked."""
+"""Write the recording again with dynamic beams blanked, 2D or 3D: for mapping and localization
+programs that assume a static world. Bags, CARMEN logs, KITTI folders, PCD, PLY, LAS and LAZ
+files keep their format, in which nothing else changes, unless FILE has the ending of another one
+or --to names it; E57, 3DTK and depth images come back as PLY or PCD. Parts of one run become one
+recording. Of a place FILE is a folder, with a recording for each of its sessions.
+
+examples:
+  stillmap filter out -o clean.clf.gz
+  stillmap filter out -o clean.log --below 0.3 --input moved/log.log
+  stillmap filter out -o clean            a KITTI folder, of a result of one
+  stillmap filter out -o clean.mcap       a bag, of any result
+  stillmap filter out -o clean --to pcd   a folder of PCD files
+  stillmap filter place -o clean          a folder with a recording of every session
+  stillmap filter place/sessions/monday -o monday.bag
+"""
 
 import argparse
 import dataclasses
@@ -18,22 +32,6 @@ if TYPE_CHECKING:
     from stillmap.io.filter_writers import FilterTarget
     from stillmap.results.folder import ResultFolder
 
-DESCRIPTION = (
-    "Write the recording again with dynamic beams blanked, 2D or 3D: for mapping and localization "
-    "programs that assume a static world. Bags, CARMEN logs, KITTI folders, PCD, PLY, LAS and LAZ "
-    "files keep their format, in which nothing else changes, unless FILE has the ending of another "
-    "one or --to names it; E57, 3DTK and depth images come back as PLY or PCD. Parts of one run "
-    "become one recording. Of a place FILE is a folder, with a recording for each of its sessions."
-)
-EPILOG = """examples:
-  stillmap filter out -o clean.clf.gz
-  stillmap filter out -o clean.log --below 0.3 --input moved/log.log
-  stillmap filter out -o clean            a KITTI folder, of a result of one
-  stillmap filter out -o clean.mcap       a bag, of any result
-  stillmap filter out -o clean --to pcd   a folder of PCD files
-  stillmap filter place -o clean          a folder with a recording of every session
-  stillmap filter place/sessions/monday -o monday.bag
-"""
 
 _INDEX = "filtered.json"  # the list of what the folder of a place holds
 

@@ -1,4 +1,18 @@
-"""`stillmap fleet`: many recordings mapped, and merged per place."""
+"""Map many recordings, and merge those of one place. The results lie in DIR, with a page about all
+of them, fleet.html. The same command goes on after an interruption, and maps only what is new or
+has changed.
+
+examples:
+  stillmap fleet monday.bag tuesday.bag -o out --merge
+  stillmap fleet recordings -o out --jobs 4
+  stillmap fleet 'logs/*.clf.gz' -o out --resolution 0.1
+  stillmap fleet --manifest robots.csv -o out --json
+  stillmap fleet --manifest robots.csv -o s3://maps/today --scheduler tcp://head:8786
+
+manifest: CSV with the heading input,place, or JSON: [{"input": ..., "place": ...}, ...]
+
+exit status: 0 all were mapped; 3 some failed, each is named; 2 the call is at fault
+"""
 
 import argparse
 import json
@@ -18,23 +32,6 @@ if TYPE_CHECKING:
 
 EXIT_SOME_FAILED = 3
 _ALL = "all"  # the place of --merge
-
-DESCRIPTION = (
-    "Map many recordings, and merge those of one place. The results lie in DIR, with a page about "
-    "all of them, fleet.html. The same command goes on after an interruption, and maps only what "
-    "is new or has changed."
-)
-EPILOG = """examples:
-  stillmap fleet monday.bag tuesday.bag -o out --merge
-  stillmap fleet recordings -o out --jobs 4
-  stillmap fleet 'logs/*.clf.gz' -o out --resolution 0.1
-  stillmap fleet --manifest robots.csv -o out --json
-  stillmap fleet --manifest robots.csv -o s3://maps/today --scheduler tcp://head:8786
-
-manifest: CSV with the heading input,place, or JSON: [{"input": ..., "place": ...}, ...]
-
-exit status: 0 all were mapped; 3 some failed, each is named; 2 the call is at fault
-"""
 
 
 FLAGS = f"""

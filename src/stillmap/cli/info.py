@@ -1,24 +1,7 @@
-"""`stillmap info INPUT...`: print summaries of recordings."""
+"""Show what is in a recording: scans, beams, field of view, ranges, duration, odometry and damage;
+values estimated from the readings are marked.
 
-import argparse
-import json
-from collections.abc import Iterator
-from itertools import pairwise
-from typing import Any
-
-from stillmap.cli.arguments import JSON, OTHERS, READ, read_options
-from stillmap.cli.console import format_rows, print_lines, show_share
-from stillmap.core.errors import InputError
-from stillmap.core.json import to_jsonable
-
-# entries of the summary that its text does not show, or shows in its heading
-_HIDDEN = ("input", "format", "dimension", "skipped_unit", "records", "read_options")
-
-DESCRIPTION = (
-    "Show what is in a recording: scans, beams, field of view, ranges, duration, "
-    "odometry and damage; values estimated from the readings are marked."
-)
-EPILOG = """examples:
+examples:
   stillmap info log.clf.gz
   stillmap info sim --json
   stillmap info run_0.bag run_1.bag
@@ -33,6 +16,20 @@ formats:
   PCD, PLY            a file, or a folder of them
   LAS, E57, 3DTK      likewise
 """
+
+import argparse
+import json
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+from stillmap.cli.arguments import JSON, OTHERS, READ, read_options
+from stillmap.cli.console import format_rows, print_lines, show_share
+from stillmap.core.errors import InputError
+from stillmap.core.json import to_jsonable
+
+# entries of the summary that its text does not show, or shows in its heading
+_HIDDEN = ("input", "format", "dimension", "skipped_unit", "records", "read_options")
 
 
 FLAGS = f"""

@@ -1,4 +1,18 @@
-"""`stillmap live`: map while scans arrive, from a robot in ROS 2 or from a recording."""
+"""Map scan by scan, as a robot would while it drives: each pose and P(static) of each beam follow
+from what is known at the time. Alone it is a node in ROS 2, which must be sourced first; Ctrl-C
+ends it and writes DIR. With --replay the scans of a recording are pushed as fast as possible,
+and the result is the same to the bit every time. DIR has what `stillmap map` writes, of what is
+known at the end, and in live/ what was answered at the time. The drive itself is written to
+DIR/recording while it lasts: `stillmap map DIR/recording` reads it, whatever has happened.
+
+examples:
+  stillmap live --replay log.clf.gz -o out
+  stillmap live --replay log.bag -o out --json --quiet
+  stillmap live --replay log.bag -o out --rate 1
+  stillmap live --replay log.bag -o out --rate 1 --foxglove
+  stillmap live --replay tuesday.bag --map monday -o out
+  stillmap live -o out --ros-args -p base_frame:=base_link -r scan:=front/scan
+"""
 
 import argparse
 import math
@@ -16,24 +30,6 @@ from stillmap.core.errors import InputError, import_extra
 if TYPE_CHECKING:
     from stillmap.live.replay import Show
     from stillmap.pipeline.options import Options
-
-DESCRIPTION = (
-    "Map scan by scan, as a robot would while it drives: each pose and P(static) of each beam "
-    "follow from what is known at the time. Alone it is a node in ROS 2, which must be sourced "
-    "first; Ctrl-C ends it and writes DIR. With --replay the scans of a recording are pushed as "
-    "fast as possible, and the result is the same to the bit every time. DIR has what `stillmap "
-    "map` writes, of what is known at the end, and in live/ what was answered at the time. The "
-    "drive itself is written to DIR/recording while it lasts: `stillmap map DIR/recording` reads "
-    "it, whatever has happened."
-)
-EPILOG = """examples:
-  stillmap live --replay log.clf.gz -o out
-  stillmap live --replay log.bag -o out --json --quiet
-  stillmap live --replay log.bag -o out --rate 1
-  stillmap live --replay log.bag -o out --rate 1 --foxglove
-  stillmap live --replay tuesday.bag --map monday -o out
-  stillmap live -o out --ros-args -p base_frame:=base_link -r scan:=front/scan
-"""
 
 
 FLAGS = f"""

@@ -1,4 +1,17 @@
-"""`stillmap map`: parse, read, build, save."""
+"""Map a recording: estimate the pose of every scan, the probability of every beam to have hit
+something static, and the map of what is static. The result is a folder; open it with `stillmap
+view`. Several inputs are parts of one run, joined in the order of their stamps.
+
+examples:
+  stillmap map log.clf.gz -o out
+  stillmap map sim -o out --overwrite --resolution 0.1
+  stillmap map log.clf.gz -o out --min-range 0.3 --set em.max_iterations=3
+  stillmap map log.clf.gz -o out --poses poses.tum --config options.toml
+  stillmap map log.bag -o out --resume
+  stillmap map run_0.bag run_1.bag run_2.bag -o out
+  stillmap map sim/horizontal -o out --tilting sim/tilting
+  stillmap map log.clf.gz -o out --quiet --json
+"""
 
 import argparse
 import shlex
@@ -14,23 +27,6 @@ from stillmap.core.errors import InputError, is_out_of_memory, memory_error
 if TYPE_CHECKING:
     from stillmap.core.recording import Recording
     from stillmap.pipeline.checkpoint import CheckpointFolder
-
-DESCRIPTION = (
-    "Map a recording: estimate the pose of every scan, the probability of every "
-    "beam to have hit something static, and the map of what is static. The result is a folder; "
-    "open it with `stillmap view`. Several inputs are parts of one run, joined in the order of "
-    "their stamps."
-)
-EPILOG = """examples:
-  stillmap map log.clf.gz -o out
-  stillmap map sim -o out --overwrite --resolution 0.1
-  stillmap map log.clf.gz -o out --min-range 0.3 --set em.max_iterations=3
-  stillmap map log.clf.gz -o out --poses poses.tum --config options.toml
-  stillmap map log.bag -o out --resume
-  stillmap map run_0.bag run_1.bag run_2.bag -o out
-  stillmap map sim/horizontal -o out --tilting sim/tilting
-  stillmap map log.clf.gz -o out --quiet --json
-"""
 
 
 FLAGS = f"""

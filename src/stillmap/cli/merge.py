@@ -1,4 +1,17 @@
-"""`stillmap merge`: sessions of one place into one map with dated changes."""
+"""Merge sessions of one place, hours or months apart and from any start, into one map. Each SESSION
+is a recording, which is mapped first, or a folder that `stillmap map` wrote; a place that an
+earlier merge wrote may go first and grows. What changed between sessions is listed with the
+sessions between which it changed. A session that cannot be placed for certain is left out, and
+named with the reason.
+
+examples:
+  stillmap merge monday.bag tuesday.bag -o place
+  stillmap merge out1 out2 out3 -o place --map-state majority
+  stillmap merge place wednesday.bag -o place2
+  stillmap merge out1 out2 -o place --frame out2
+
+exit status 2 where fewer than two sessions could be placed
+"""
 
 import argparse
 from pathlib import Path
@@ -11,22 +24,6 @@ from stillmap.core.errors import InputError
 if TYPE_CHECKING:
     from stillmap.places.finish import PlaceResult
     from stillmap.places.merge import MergeJob
-
-DESCRIPTION = (
-    "Merge sessions of one place, hours or months apart and from any start, into one map. Each "
-    "SESSION is a recording, which is mapped first, or a folder that `stillmap map` wrote; a place "
-    "that an earlier merge wrote may go first and grows. What changed between sessions is listed "
-    "with the sessions between which it changed. A session that cannot be placed for certain is "
-    "left out, and named with the reason."
-)
-EPILOG = """examples:
-  stillmap merge monday.bag tuesday.bag -o place
-  stillmap merge out1 out2 out3 -o place --map-state majority
-  stillmap merge place wednesday.bag -o place2
-  stillmap merge out1 out2 -o place --frame out2
-
-exit status 2 where fewer than two sessions could be placed
-"""
 
 
 FLAGS = f"""

@@ -125,8 +125,9 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
     for name, about in COMMANDS.items():
         if name in wanted:
             module = import_module(f"stillmap.cli.{name}")
+            text, _, examples = (module.__doc__ or "").partition("\n\n")
             command = commands.add_parser(
-                name, help=about, description=module.DESCRIPTION, epilog=module.EPILOG
+                name, help=about, description=" ".join(text.split()), epilog=examples
             )
             add_flags(command, module.FLAGS)
             if hasattr(module, "add_arguments"):

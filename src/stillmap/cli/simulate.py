@@ -1,35 +1,29 @@
-"""`stillmap simulate SCENE`: simulate a recording with truth, for tests and demos."""
+"""Simulate a robot in a place with moving people, doors and cars, and write its recording with the
+truth. Options that are not given are those of the scene.
 
-import argparse
-from importlib import resources
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from stillmap.cli.arguments import JSON, OVERWRITE, make_parents
-from stillmap.cli.console import list_files, print_json, say, show_share
-from stillmap.core.errors import InputError
-
-if TYPE_CHECKING:
-    from stillmap.sim import Scene
-
-DESCRIPTION = (
-    "Simulate a robot in a place with moving people, doors and cars, and write its "
-    "recording with the truth. Options that are not given are those of the scene."
-)
-
-
-def _list_scenes() -> str:
-    """Name and first line of the data file of each scene."""
-    about = {}
-    for file in (resources.files("stillmap") / "sim" / "worlds").iterdir():
-        if file.name.endswith(".toml"):
-            with file.open(encoding="utf-8") as text:
-                about[file.name.removesuffix(".toml")] = text.readline()[2:].strip()
-    return "".join(f"  {name:<16} {what}\n" for name, what in sorted(about.items()))
-
-
-EPILOG = f"""scenes:
-{_list_scenes()}\
+scenes:
+  building         one floor of eight wings, 14 people
+  corridor         a loop of 36 x 22 m, 20 people
+  corridor-crowd   the same with 40 people
+  crossing         two streets of 180 m, lights, old trees, a park, 16 cars, 30 pedestrians
+  drive            970 m by car, with a red light
+  gallery          28 x 18 m, mirrors and glass, 8 people
+  hall             45 x 30 m, 15 people
+  hall-crowd       the same with 60 people
+  lookalike-1      a corridor of 40 m, 4 people
+  lookalike-2      another one of the same shape with other rooms
+  office           40 x 25 m, 22 doors, 10 people
+  office-moved     things are moved between two visits
+  rounds           197 x 82 m, corridors around six courtyards, 40 people
+  street           180 m, there and back, 14 cars, 16 pedestrians
+  street-jam       the street with lights and a queue; everybody stops at times
+  street-moved     parked cars drive off, others park
+  street-oncoming  260 m of a bending road, one way, 16 cars that come towards the robot
+  street-turn      185 m, one way, waiting and driving cars
+  ten-corridors    56 x 37 m, corridors of the same shape
+  two-wings        two such corridors that share a door, 6 people
+  warehouse        50 x 30 m, 12 people, 2 forklifts
+  warehouse-moved  racks are emptied and filled overnight
   NAME-empty       any but the -crowd ones, without people and vehicles
 
 examples:
@@ -40,6 +34,18 @@ examples:
   stillmap simulate hall -o sim --lidar tilting --rate 37.5 --scans 900 --camera
   stillmap simulate office -o days --sessions 5 --seed 3
 """
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stillmap.cli.arguments import JSON, OVERWRITE, make_parents
+from stillmap.cli.console import list_files, print_json, say, show_share
+from stillmap.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stillmap.sim import Scene
+
 
 FLAGS = f"""
 scene SCENE  one of those listed below

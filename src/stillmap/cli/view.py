@@ -1,4 +1,16 @@
-"""`stillmap view DIR`: show a result, or its report, in the browser."""
+"""Show a result in the browser, scan by scan: map, beams, points, surface, trajectory and moving
+objects; a place session by session, with what changed. The page is served to this machine only,
+until Ctrl-C, and requests nothing from outside. It needs the extra `viewer`; without it, the
+command that installs it is printed and the report is opened. Without a screen, the address is
+printed.
+
+examples:
+  stillmap view out                     map, beams, points, models and objects over time
+  stillmap view out --report            the report
+  stillmap view place                   a place of several sessions, and what changed
+  firefox "$(stillmap view out --print)"
+  ssh -L 8080:127.0.0.1:8080 robot stillmap view out --port 8080
+"""
 
 import argparse
 import os
@@ -17,21 +29,6 @@ if TYPE_CHECKING:
 
 
 _REPORT, _LAST_PORT = "report.html", 65_535
-
-DESCRIPTION = (
-    "Show a result in the browser, scan by scan: map, beams, points, surface, "
-    "trajectory and moving objects; a place session by session, with what changed. The page is "
-    "served to this machine only, until Ctrl-C, and "
-    "requests nothing from outside. It needs the extra `viewer`; without it, the command that "
-    "installs it is printed and the report is opened. Without a screen, the address is printed."
-)
-EPILOG = """examples:
-  stillmap view out                     map, beams, points, models and objects over time
-  stillmap view out --report            the report
-  stillmap view place                   a place of several sessions, and what changed
-  firefox "$(stillmap view out --print)"
-  ssh -L 8080:127.0.0.1:8080 robot stillmap view out --port 8080
-"""
 
 
 FLAGS = """
