@@ -5,19 +5,17 @@ Not in a thread: GTSAM holds Python's lock while it solves a pose graph.
 
 import itertools
 import logging
-import os
-import pickle
 import queue
 import subprocess
 import sys
 import threading
-import traceback
 from collections import deque
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from stillmap.core.array_types import Float
 from stillmap.core.parallel import trim_heap
@@ -32,20 +30,6 @@ _TRIM_EVERY = 64  # scans after which the child gives freed memory back
 _SECONDS_TO_END = 5.0  # before the process is killed
 
 
-def send(stream: IO[bytes], *messages: Any) -> None:
-    """Write messages and flush."""
-    for message in messages:
-        pickle.dump(message, stream, pickle.HIGHEST_PROTOCOL)
-    stream.flush()
-
-
-def receive(stream: IO[bytes]) -> Iterator[Any]:
-    """The messages until the stream ends, perhaps amid one."""
-    with suppress(EOFError, pickle.UnpicklingError):
-        while True:
-            yield pickle.load(stream)
-
-
 class LoopProcess:
     """A `LoopCloser` in a child process: scans go there, corrections come back.
 
@@ -56,12 +40,15 @@ class LoopProcess:
     """
 
     def __init__(self, options: SlamOptions, dimension: int, folder: Path | None = None) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "stillmap.live.loop_process"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            process_group=0,  # Ctrl-C is for this process alone
-        )
+        self._pipe, end = Pipe()
+        with end:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "stillmap.live.loop_process", str(end.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[end.fileno()],
+                process_group=0,  # Ctrl-C is for this process alone
+            )
         self._outgoing = queue.SimpleQueue[Any]()
         self._outgoing.put((options, dimension, folder))
         self._incoming = deque[Correction]()
@@ -97,21 +84,20 @@ class LoopProcess:
             self._process.wait()
         for thread in self._threads:
             thread.join()
+        self._pipe.close()
 
     def _send(self) -> None:
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError), self._process.stdin as stdin:
+        with suppress(OSError):  # the process has ended
             for message in iter(self._outgoing.get, None):
-                send(stdin, message)
+                self._pipe.send(message)
+            self._pipe.send(None)
 
     def _receive(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as stdout:
-            messages = receive(stdout)
-            for correction, count in messages:
-                near = list(itertools.islice(messages, count))
-                if len(near) == count:  # else the process has ended amid them
-                    self._incoming.append(replace(correction, near=near))
+        with suppress(EOFError, OSError):  # the process has ended, perhaps amid a correction
+            while True:
+                correction, count = self._pipe.recv()
+                near = [self._pipe.recv() for _ in range(count)]
+                self._incoming.append(replace(correction, near=near))
 
 
 def make_closer(
@@ -123,36 +109,26 @@ def make_closer(
     return LiveSweepLoopCloser(options, folder, threads)
 
 
-def _close_loops(source: IO[bytes], target: IO[bytes]) -> None:
+def _close_loops(pipe: "Connection[Any, Any]") -> None:
     """Close loops between the scans that arrive, until there are no more."""
-    messages = receive(source)
-    options, dimension, folder = next(messages)
+    options, dimension, folder = pipe.recv()
     # one thread: the other cores answer scans
     closer = make_closer(options, dimension, folder, threads=1)
-    arrived = queue.SimpleQueue[Any]()
-
-    def listen() -> None:
-        for message in messages:
-            arrived.put(message)
-        arrived.put(None)
-
-    threading.Thread(target=listen, daemon=True).start()
-    for number, message in enumerate(iter(arrived.get, None), start=1):
+    for number in itertools.count(1):
+        message = pipe.recv()
+        if message is None:
+            return
         if number % _TRIM_EVERY == 0:
             trim_heap()
         closer.add(*message)
-        if arrived.empty() and (correction := closer.poll()) is not None:
-            # scan by scan: all at once would be unpacked with Python's lock held
-            send(target, (replace(correction, near=[]), len(correction.near)), *correction.near)
+        if not pipe.poll() and (correction := closer.poll()) is not None:
+            pipe.send((replace(correction, near=[]), len(correction.near)))
+            for scan in correction.near:  # all at once would be unpacked with Python's lock held
+                pipe.send(scan)
             del correction
             trim_heap()
 
 
 if __name__ == "__main__":
-    try:
-        _close_loops(sys.stdin.buffer, sys.stdout.buffer)
-    except OSError:
-        os._exit(0)  # the other process has ended, or the disk is full: it says so
-    except Exception:
-        traceback.print_exc()
-        os._exit(1)  # at once: a thread still reads
+    with suppress(EOFError, OSError):  # the other process has ended, or says that the disk is full
+        _close_loops(Connection(int(sys.argv[1])))

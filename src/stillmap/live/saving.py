@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float, Float32, Int64
-from stillmap.core.arrays import empty, write_npy
+from stillmap.core.arrays import write_npy
 from stillmap.core.errors import advise, cannot_write
 from stillmap.core.files import require_new, resolve_output
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.source import Source
+from stillmap.io.builder import reorder_scans
 from stillmap.io.stillmap_folder import HEADER
 from stillmap.io.trajectory import write_tum
 from stillmap.live.history import FOLDER as RECORDING
@@ -157,20 +158,16 @@ class Snapshot(ShortRepr):
             recording = replace(recording, source=source)
         if len(scans) == recording.n_scans:
             return replace(self, recording=recording)
-        counts = np.diff(recording.offset)[scans]
-        offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)])
+        counts = np.diff(recording.offset)
 
         def take(array: NDArray[Any]) -> NDArray[Any]:
-            out = empty((int(offset[-1]), *array.shape[1:]), array.dtype, recording.scratch)
-            for number, scan in enumerate(recording.iter_scans(scans.tolist(), array, out)):
-                out[offset[number] : offset[number + 1]] = array[recording.beams_of(scan)]
-            return out
+            return reorder_scans(array, counts, scans, recording.scratch)
 
         times, odometry = recording.beam_time, recording.T_odom_base
         taken = replace(
             recording,
             stamp_ns=recording.stamp_ns[scans],
-            offset=offset,
+            offset=np.concatenate([[0], np.cumsum(counts[scans])]).astype(np.int64),
             points=take(recording.points),
             hit=take(recording.hit),
             sensor=recording.sensor[scans],
