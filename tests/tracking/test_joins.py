@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from stillmap.tracking.joins import Looks, compute_marginals, join_pieces
+from stillmap.tracking.joins import Detections, compute_marginals, join_pieces
 
 PERIOD = 0.2
 
@@ -18,8 +18,8 @@ def join(*pieces, is_fast=False):
         t = np.arange(first, last, PERIOD)
         xy = np.array(x) + t[:, None] * np.array(v) + rng.normal(0.0, 0.03, (len(t), 2))
         columns.append((np.full(len(t), number), t, xy, np.full(len(t), width)))
-    looks = Looks._make(np.concatenate(column) for column in zip(*columns, strict=True))
-    mover, p = join_pieces(looks, np.full(len(pieces), is_fast), PERIOD)
+    detections = Detections._make(np.concatenate(column) for column in zip(*columns, strict=True))
+    mover, p = join_pieces(detections, np.full(len(pieces), is_fast), PERIOD)
     return mover.tolist(), p
 
 
@@ -74,8 +74,8 @@ def test_a_vehicle_that_is_hidden_is_the_same():
 
 
 def test_nothing_to_join():
-    looks = Looks(np.zeros(0, int), np.zeros(0), np.zeros((0, 2)), np.zeros(0))
-    mover, p = join_pieces(looks, np.zeros(0, bool), PERIOD)
+    detections = Detections(np.zeros(0, int), np.zeros(0), np.zeros((0, 2)), np.zeros(0))
+    mover, p = join_pieces(detections, np.zeros(0, bool), PERIOD)
     assert len(mover) == len(p) == 0
 
 

@@ -35,8 +35,8 @@ _MAP_PRIOR = 0.5
 # likewise for the local map until more is known: people who walk along with the robot are always
 # ahead of it, where nobody has looked before
 _RECENT_PRIOR = 0.05
-# ns within which a part of the map that changed is told, about; parts that are told at once
-_TOLD_WITHIN_NS, _MIN_CHANGES = 10**9, 8
+# ns within which a part of the map that changed is reported, about; parts that are reported at once
+_REPORTED_WITHIN_NS, _MIN_CHANGES = 10**9, 8
 
 
 def find_pixel_size(points: Float32, hit: Bool) -> tuple[float, float]:
@@ -117,7 +117,7 @@ class CausalLabels:
         self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
         # lowest cells of the blocks in `take_changes` so far, as bytes; of another filter than now
         self._reported, self._is_replaced = set[bytes](), False
-        self._told_ns = -_TOLD_WITHIN_NS
+        self._reported_ns = -_REPORTED_WITHIN_NS
 
     @property
     def filter(self) -> OccupancyFilter:
@@ -231,9 +231,9 @@ class CausalLabels:
         Args:
             stamp_ns: of the last scan.
         """
-        share = min((stamp_ns - self._told_ns) / _TOLD_WITHIN_NS, 1.0)
+        share = min((stamp_ns - self._reported_ns) / _REPORTED_WITHIN_NS, 1.0)
         most = max(math.ceil(share * self.filter.changed_count), _MIN_CHANGES)
-        self._told_ns = stamp_ns
+        self._reported_ns = stamp_ns
         lowest, tiles = self.filter.take_changed_blocks(most, odds_factor=self._odds_factor)
         changes = list(map(MapChange, lowest, tiles))
         if self._is_replaced:

@@ -59,6 +59,6 @@ def sample_points(
     parts = [np.zeros(0, np.int64)]
     for block, start, end in zip(iter_blocks(*arrays), before[:-1], before[1:], strict=True):
         low, high = np.searchsorted(chosen, [start, end])
-        found = np.flatnonzero(is_chosen(block))
-        parts.append(block.start + found[chosen[low:high] - start])
+        candidates = np.flatnonzero(is_chosen(block))
+        parts.append(block.start + candidates[chosen[low:high] - start])
     return recording.end_points(np.concatenate(parts), poses)

@@ -247,7 +247,9 @@ def _group_events(events: _Events, cells: Cells, radius: float) -> list[_Events]
     begin = np.maximum(events.before[i], events.before[j])
     end = np.minimum(events.after[i], events.after[j])
     fits = (events.came[i] == events.came[j]) & (begin < end + slack)
-    return [events.select(one) for one in connected_components(pairs[fits], len(events.cell))]
+    return [
+        events.select(members) for members in connected_components(pairs[fits], len(events.cell))
+    ]
 
 
 def _split_by_time(events: _Events, cells: Cells, resolution: float) -> list[Change]:
@@ -276,10 +278,10 @@ def _recurring_changes(
     """Places that changed again and again: doors, gates, parking bays."""
     out = []
     pairs = neighbor_pairs(changed.cells[recurring], _LINK_DISTANCE / resolution)
-    for one in connected_components(pairs, len(recurring)):
-        if len(one) < _MIN_CELLS:
+    for members in connected_components(pairs, len(recurring)):
+        if len(members) < _MIN_CELLS:
             continue
-        chosen = recurring[one]
+        chosen = recurring[members]
         bins = changed.change_bins[chosen]
         stamp = int(stamps.first(bins[:, 0, 1]).min())
         before = min(int(stamps.last(bins[:, 0, 0]).max()), stamp)
@@ -296,13 +298,13 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
     A person may have stood where an object came a little later, or where it had left.
     """
     out: list[Change] = []
-    for one in sorted(changes, key=lambda change: -len(change.cells)):
+    for change in sorted(changes, key=lambda change: -len(change.cells)):
         for k, larger in enumerate(out):
-            small = one.kind == larger.kind and 2 * len(one.cells) <= len(larger.cells)
-            if small and _within(larger.cells, one.cells, radius):
+            small = change.kind == larger.kind and 2 * len(change.cells) <= len(larger.cells)
+            if small and _within(larger.cells, change.cells, radius):
                 out[k] = _make_change(
-                    one.kind,
-                    np.unique(np.concatenate([larger.cells, one.cells]), axis=0),
+                    change.kind,
+                    np.unique(np.concatenate([larger.cells, change.cells]), axis=0),
                     resolution,
                     larger.before_ns,
                     larger.stamp_ns,
@@ -311,7 +313,7 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
                 )
                 break
         else:
-            out.append(one)
+            out.append(change)
     return out
 
 
@@ -334,10 +336,10 @@ def _remove_noise(changes: list[Change], unchanged: Cells) -> list[Change]:
 
     tree = cKDTree(unchanged)
     out = []
-    for one in changes:
-        distance, _ = tree.query(one.cells, distance_upper_bound=_NOISE + 1.0)
+    for change in changes:
+        distance, _ = tree.query(change.cells, distance_upper_bound=_NOISE + 1.0)
         if np.count_nonzero(distance > _NOISE) >= _MIN_CELLS:
-            out.append(one)
+            out.append(change)
     return out
 
 

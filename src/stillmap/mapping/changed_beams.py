@@ -75,14 +75,15 @@ def find_changed_object_beams(
     doors are left out: they may be people who wait there.
     """
     stays = [
-        _Stay.from_change(one, changes)
-        for one in changes
-        if one.kind != "comes and goes" or fit_sector(one.cells, one.resolution) is not None
+        _Stay.from_change(change, changes)
+        for change in changes
+        if change.kind != "comes and goes"
+        or fit_sector(change.cells, change.resolution) is not None
     ]
-    for one in doors:  # whose leaf is elsewhere is among the changes
-        if not (len(one.shut_cells) and len(one.open_cells)):
-            stays.append(_Stay.around_cells(one.swept_cells, _EVER))
-    found = ArrayBuilder(np.intp, (), recording.scratch)
+    for door in doors:  # whose leaf is elsewhere is among the changes
+        if not (len(door.shut_cells) and len(door.open_cells)):
+            stays.append(_Stay.around_cells(door.swept_cells, _EVER))
+    on_objects = ArrayBuilder(np.intp, (), recording.scratch)
     for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():
         beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
         ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
@@ -91,8 +92,8 @@ def find_changed_object_beams(
         for stay in stays:
             inside = np.flatnonzero(stay.bounds(cells, stamp))
             on_object[inside] |= stay.mask[tuple((cells[inside] - stay.low).T)]
-        found.append(beam[on_object])
-    return found.finish()
+        on_objects.append(beam[on_object])
+    return on_objects.finish()
 
 
 class _Stay(NamedTuple):
@@ -125,14 +126,14 @@ class _Stay(NamedTuple):
 def _stay_span(change: Change, changes: list[Change]) -> tuple[int, int]:
     """The stamps after which and until which an object stood there, as far as is known."""
     since, until = _EVER
-    here = [one for one in changes if is_same_place(one, change)]
+    here = [near for near in changes if is_same_place(near, change)]
     if change.kind == "came":
         since = change.before_ns
-        left = [one.before_ns for one in here if one.kind == "left"]
+        left = [near.before_ns for near in here if near.kind == "left"]
         until = min((stamp for stamp in left if stamp > since), default=until)
     elif change.kind == "left":
         until = change.before_ns
-        came = [one.before_ns for one in here if one.kind == "came"]
+        came = [near.before_ns for near in here if near.kind == "came"]
         since = max((stamp for stamp in came if stamp < until), default=since)
     return since, until
 

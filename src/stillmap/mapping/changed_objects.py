@@ -32,10 +32,10 @@ def find_shown_cells(
         the leaf of a door, in any position.
     """
     keys = cell_keys(histories.cells)
-    listed = np.isin(keys, cell_keys(np.concatenate([one.cells for one in changes])))
+    listed = np.isin(keys, cell_keys(np.concatenate([change.cells for change in changes])))
     p = histories.p_in_map(state, pool_states(histories, changes, state))
     p_leaf = _weigh_leaves(keys, changes)
-    for door in (one.door for one in changes if one.door is not None):
+    for door in (change.door for change in changes if change.door is not None):
         shown = door.position_in(state)
         for position, leaf in (("open", door.open_cells), ("shut", door.shut_cells)):
             of = _rows(keys, leaf)
@@ -49,13 +49,17 @@ def _weigh_leaves(keys: Cells, changes: list[Change]) -> Float32:
     A straight row of cells that changed may be a leaf that was seen in one position only, or one
     side of a thing. Of all such rows, the share that others are doors by what was seen of them.
     """
-    doors = [one for one in changes if one.door is not None]
-    rows = [one for one in changes if one.door is None and is_row(one.cells, one.resolution)]
+    doors = [change for change in changes if change.door is not None]
+    rows = [
+        change
+        for change in changes
+        if change.door is None and is_row(change.cells, change.resolution)
+    ]
     share = (len(doors) + 1.0) / (len(doors) + len(rows) + 2.0)
     out = np.zeros(len(keys), np.float32)
     for some, p in ((rows, share), (doors, 1.0)):
-        for one in some:
-            out[_rows(keys, one.cells)] = p
+        for change in some:
+            out[_rows(keys, change.cells)] = p
     return out
 
 
@@ -75,13 +79,14 @@ def pool_states(histories: em.CellHistories, changes: list[Change], state: em.Ma
     share = histories.share_there(state)
     weight = np.maximum(histories.p_changing, _MIN_WEIGHT).astype(np.float64)
     out = share.copy()
-    recurring = [one.cells for one in changes if one.kind == "comes and goes"]
+    recurring = [change.cells for change in changes if change.kind == "comes and goes"]
     if recurring:
         of = _rows(keys, np.concatenate(recurring))
         out[of] = _local_mean(histories.cells[of], share[of], weight[of])
-    moved = [one for one in changes if one.kind in ("came", "left")]
+    moved = [change for change in changes if change.kind in ("came", "left")]
     members = [
-        _rows(keys, np.concatenate([moved[k].cells for k in one])) for one in group_objects(moved)
+        _rows(keys, np.concatenate([moved[k].cells for k in indices]))
+        for indices in group_objects(moved)
     ]
     for of in members:
         out[of] = 0.0
@@ -98,9 +103,9 @@ def _rows(keys: Cells, cells: Cells) -> Index:
 def _local_mean(cells: Cells, share: Float32, weight: Float) -> Float:
     """(K,) weighted mean of the share (K,) of the cells (K, 2) within a radius of each."""
     pairs = neighbor_pairs(cells, _RADIUS)
-    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    cell, neighbor = np.concatenate([pairs, pairs[:, ::-1]]).T
     sums = [
-        value + np.bincount(one, value[other], minlength=len(cells))
+        value + np.bincount(cell, value[neighbor], minlength=len(cells))
         for value in (weight * share, weight)
     ]
     return np.asarray(sums[0] / sums[1])
@@ -108,8 +113,8 @@ def _local_mean(cells: Cells, share: Float32, weight: Float) -> Float:
 
 def group_objects(changes: list[Change]) -> list[Index]:
     """Indices, rising, of the changes of each object: those of the same place."""
-    xy = np.array([(one.x, one.y) for one in changes]).reshape(-1, 2)
-    size = np.array([one.size[:2] for one in changes]).reshape(-1, 2)
+    xy = np.array([(change.x, change.y) for change in changes]).reshape(-1, 2)
+    size = np.array([change.size[:2] for change in changes]).reshape(-1, 2)
     near = (np.abs(xy[:, None] - xy) <= size[:, None] + size).all(axis=2)
     pairs = [
         pair
@@ -119,12 +124,12 @@ def group_objects(changes: list[Change]) -> list[Index]:
     return connected_components(np.array(pairs, np.intp).reshape(-1, 2), len(changes))
 
 
-def is_same_place(one: Change, other: Change) -> bool:
+def is_same_place(first: Change, second: Change) -> bool:
     """True if the larger of two places holds more than half of the smaller."""
-    distance = np.abs([one.x - other.x, one.y - other.y])
-    if np.any(distance > np.array(one.size) + np.array(other.size)):
+    distance = np.abs([first.x - second.x, first.y - second.y])
+    if np.any(distance > np.array(first.size) + np.array(second.size)):
         return False
-    smaller, larger = sorted((one.cells, other.cells), key=len)
+    smaller, larger = sorted((first.cells, second.cells), key=len)
     return bool(np.mean(np.isin(cell_keys(smaller), cell_keys(larger))) > 0.5)
 
 
@@ -157,16 +162,16 @@ def detect_changes_3d(
     lasting = _select_lasting(changed, _MIN_STAY / time_bin, 1e-9 * (last - first) / time_bin)
     unchanged = np.zeros((0, 3), np.int64)  # large objects need no test against noise
     objects = [
-        one
-        for one in group_changes(lasting, unchanged, recording, resolution, time_bin)
-        if one.size[2] >= _MIN_HEIGHT
-        and len(one.cells) * resolution**2 >= _MIN_AREA
-        and 1e-9 * min(one.stamp_ns - first, last - one.before_ns) >= _MIN_STAY
+        change
+        for change in group_changes(lasting, unchanged, recording, resolution, time_bin)
+        if change.size[2] >= _MIN_HEIGHT
+        and len(change.cells) * resolution**2 >= _MIN_AREA
+        and 1e-9 * min(change.stamp_ns - first, last - change.before_ns) >= _MIN_STAY
     ]
     dwell_times = measure_dwell_times(objects, recording, poses, resolution)
     return [
-        replace(one, cells=np.unique(one.cells[:, :2], axis=0))
-        for one, seconds in zip(objects, dwell_times, strict=True)
+        replace(change, cells=np.unique(change.cells[:, :2], axis=0))
+        for change, seconds in zip(objects, dwell_times, strict=True)
         if seconds >= _MIN_STAY
     ]
 
@@ -196,15 +201,19 @@ def measure_dwell_times(
     if not places:
         return []
     # the N voxels of all places; one of several places is there several times
-    voxels = np.concatenate([one.cells for one in places])
-    place = np.repeat(np.arange(len(places)), [len(one.cells) for one in places])
+    voxels = np.concatenate([change.cells for change in places])
+    place = np.repeat(np.arange(len(places)), [len(change.cells) for change in places])
     low, high = voxels.min(axis=0), voxels.max(axis=0)
     shape = tuple((high - low + 1).tolist())
     key = np.ravel_multi_index(tuple((voxels - low).T), shape)
     limits = np.iinfo(np.int64)
     first, last = np.full(len(place), limits.max), np.full(len(place), limits.min)
-    since = np.array([one.stamp_ns if one.appeared else limits.min for one in places])[place]
-    until = np.array([limits.max if one.appeared else one.before_ns for one in places])[place]
+    since = np.array([change.stamp_ns if change.appeared else limits.min for change in places])[
+        place
+    ]
+    until = np.array([limits.max if change.appeared else change.before_ns for change in places])[
+        place
+    ]
     T_map_sensor = recording.T_map_sensor(poses)
     for t in recording.iter_scans(range(recording.n_scans)):
         stamp, beams, T = int(recording.stamp_ns[t]), recording.beams_of(t), T_map_sensor[t]
@@ -216,9 +225,9 @@ def measure_dwell_times(
         first[was_hit] = np.minimum(first[was_hit], stamp)
         last[was_hit] = np.maximum(last[was_hit], stamp)
     out = []
-    for number, one in enumerate(places):
+    for number, change in enumerate(places):
         its = place == number
-        shown = last[its] - one.stamp_ns if one.appeared else one.before_ns - first[its]
+        shown = last[its] - change.stamp_ns if change.appeared else change.before_ns - first[its]
         seconds = 1e-9 * np.where(last[its] >= first[its], shown, 0)
         out.append(float(np.quantile(seconds, _DWELL_QUANTILE, method="lower")))
     return out

@@ -49,22 +49,22 @@ def find_doors(
     left = list(changes)
     out: list[Change] = []
     candidates = _find_candidates(changes, surface)
-    doors = [_make_door(one, surface) for one in candidates]
+    doors = [_make_door(candidate, surface) for candidate in candidates]
     observed = observe_states(doors, recording, poses, resolution)
     for candidate, shape, states in zip(candidates, doors, observed, strict=True):
-        if not all(_holds(left, one) for one in candidate.changes):
+        if not all(_holds(left, change) for change in candidate.changes):
             continue  # of a door that was found before
         door = dataclasses.replace(shape, states=states)
         if not states or not is_passage_observed(door, recording, poses):
             continue  # nobody saw it in both positions
         mine = [
-            one
-            for one in left
-            if _holds(candidate.changes, one) or _is_on_leaf(candidate.sector, one)
+            change
+            for change in left
+            if _holds(candidate.changes, change) or _is_on_leaf(candidate.sector, change)
         ]
-        left = [one for one in left if not _holds(mine, one)]
+        left = [change for change in left if not _holds(mine, change)]
         out.append(_join_changes(mine, door))
-    return sorted(out, key=lambda one: (one.stamp_ns, one.x, one.y))
+    return sorted(out, key=lambda change: (change.stamp_ns, change.x, change.y))
 
 
 def _as_change(line: Cells, recording: Recording, resolution: float) -> Change:
@@ -78,20 +78,20 @@ def _as_change(line: Cells, recording: Recording, resolution: float) -> Change:
 def join_doors(changes: list[Change], doors: list[Change]) -> list[Change]:
     """All changes with the doors in place of those of their leaves, in the order of time."""
     leaves = [
-        cell_keys(np.concatenate([one.cells, one.door.shut_cells, one.door.open_cells]))
-        for one in doors
-        if one.door is not None
+        cell_keys(np.concatenate([change.cells, change.door.shut_cells, change.door.open_cells]))
+        for change in doors
+        if change.door is not None
     ]
     others = [
-        one
-        for one in changes
-        if not any(np.isin(cell_keys(one.cells), leaf).mean() >= _MIN_ON_LEAF for leaf in leaves)
+        change
+        for change in changes
+        if not any(np.isin(cell_keys(change.cells), leaf).mean() >= _MIN_ON_LEAF for leaf in leaves)
     ]
-    return sorted([*others, *doors], key=lambda one: (one.stamp_ns, one.x, one.y))
+    return sorted([*others, *doors], key=lambda change: (change.stamp_ns, change.x, change.y))
 
 
-def _holds(changes: list[Change], one: Change) -> bool:
-    return any(one is other for other in changes)
+def _holds(changes: list[Change], change: Change) -> bool:
+    return any(change is held for held in changes)
 
 
 class _Candidate(NamedTuple):
@@ -108,14 +108,12 @@ class _Candidate(NamedTuple):
 
 def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
     """Candidates for doors: first those whose positions both changed, then those of most cells."""
-    came = [one for one in changes if one.kind == "came"]
-    gone = [one for one in changes if one.kind == "left"]
-    pairs = [
-        [one, other] for one, other in itertools.product(came, gone) if _may_be_one(one, other)
-    ]
-    found = []
-    for group in [*([one] for one in changes), *pairs]:
-        cells = np.unique(np.concatenate([one.cells for one in group]), axis=0)
+    came = [change for change in changes if change.kind == "came"]
+    gone = [change for change in changes if change.kind == "left"]
+    pairs = [list(pair) for pair in itertools.product(came, gone) if _may_be_one(*pair)]
+    candidates = []
+    for group in [*([change] for change in changes), *pairs]:
+        cells = np.unique(np.concatenate([change.cells for change in group]), axis=0)
         resolution = group[0].resolution
         sector = fit_sector(cells, resolution)
         rests = sector is None
@@ -129,8 +127,8 @@ def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
             and sector.length * resolution >= _MIN_LEAF
             and _MIN_SWING <= sector.angle <= _MAX_SWING
         ):
-            found.append(_Candidate(sector, group, cells, rests))
-    return sorted(found, key=lambda one: (one.rests, -len(one.cells)))
+            candidates.append(_Candidate(sector, group, cells, rests))
+    return sorted(candidates, key=lambda candidate: (candidate.rests, -len(candidate.cells)))
 
 
 def _may_be_one(came: Change, gone: Change) -> bool:
@@ -166,7 +164,7 @@ def _make_door(candidate: _Candidate, surface: Cells) -> Door:
 
 def _join_changes(changes: list[Change], door: Door) -> Change:
     """All changes of a door in one."""
-    cells = np.unique(np.concatenate([one.cells for one in changes]), axis=0)
+    cells = np.unique(np.concatenate([change.cells for change in changes]), axis=0)
     resolution = changes[0].resolution
     x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
     swings = list(itertools.pairwise(door.states))

@@ -15,14 +15,14 @@ from stillmap.mapping.doors import Door, DoorState, Position
 _BIN_NS = 10**9  # in which the cells that were hit make one observation
 # share of the cells of a leaf that are hit in an observation: who walks through hits fewer
 _MIN_SHARE = 0.35
-_MIN_LOOKS = 2  # observations of each position
+_MIN_OBSERVATIONS = 2  # observations of each position
 _CROSSED = (0.3, 0.9)  # of the leaf, where beams pass if it is not there
 INNER = (0.2, 0.8)  # the same where it is not known which end its hinge is at
 _GOES_ON = 0.3  # m beyond it
-_MIN_CROSSING, _MAX_SCANS = 3, 500  # scans that show it; scans that are looked at
+_MIN_CROSSING, _MAX_SCANS = 3, 500  # scans that show it; scans that are tried
 _MAX_DISTANCE = 10.0  # m from the sensor to a leaf: from farther off few beams cross it
 _ASIDE = 0.3  # m to either side of a leaf, where surface is its own or goes across
-_AROUND_NS = 5 * 10**8  # before and after a look, in which the leaf is where it was seen
+_AROUND_NS = 5 * 10**8  # before and after an observation, in which the leaf is where it was seen
 _RATIO = 2.0  # of that share to the one of the other position
 
 
@@ -55,7 +55,7 @@ def observe_states(
     ]
 
 
-def observe_looks(
+def observe_leaves(
     leaves: Sequence[Cells], recording: Recording, poses: Float, resolution: float
 ) -> list[Int64]:
     """(L, 2) stamps of the first and the last scan of each second that saw a leaf.
@@ -65,7 +65,7 @@ def observe_looks(
         recording, poses, resolution: see `observe_states`.
     """
     cells = np.concatenate([np.empty((0, 2), np.int64), *leaves])
-    of = np.repeat(np.arange(len(leaves)), [len(one) for one in leaves])
+    of = np.repeat(np.arange(len(leaves)), [len(leaf) for leaf in leaves])
     order = np.argsort(cell_keys(cells))
     keys, of = cell_keys(cells)[order], of[order]
     seen = [np.empty((0, 2), np.int64)]
@@ -73,24 +73,24 @@ def observe_looks(
         beam = block.start + np.flatnonzero(recording.hit[block])
         key = cell_keys(np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64))
         at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-        found = np.flatnonzero(keys[at] == key)
-        seen.append(np.column_stack([recording.scans_of(beam[found]), at[found]]))
+        on_leaf = np.flatnonzero(keys[at] == key)
+        seen.append(np.column_stack([recording.scans_of(beam[on_leaf]), at[on_leaf]]))
     scan, cell = np.concatenate(seen).T
     return [
-        _list_looks(recording.stamp_ns, scan[mine], cell[mine], _MIN_SHARE * len(leaf))
+        _list_observations(recording.stamp_ns, scan[mine], cell[mine], _MIN_SHARE * len(leaf))
         for leaf, mine in ((leaf, of[cell] == k) for k, leaf in enumerate(leaves))
     ]
 
 
-def _list_looks(stamp_ns: Int64, scan: Int64, cell: Int64, least: float) -> Int64:
+def _list_observations(stamp_ns: Int64, scan: Int64, cell: Int64, least: float) -> Int64:
     """(L, 2) first and last stamp of the seconds in which that many cells were hit."""
     stamps = stamp_ns[scan]
-    looks = [
-        (stamps[one].min(), stamps[one].max())
-        for one in group_indices((stamps - stamp_ns[0]) // _BIN_NS)
-        if len(np.unique(cell[one])) >= least
+    observations = [
+        (stamps[second].min(), stamps[second].max())
+        for second in group_indices((stamps - stamp_ns[0]) // _BIN_NS)
+        if len(np.unique(cell[second])) >= least
     ]
-    return np.array(looks, np.int64).reshape(-1, 2)
+    return np.array(observations, np.int64).reshape(-1, 2)
 
 
 class _LeafMask:
@@ -117,10 +117,10 @@ class _LeafMask:
 def _list_states(mask: _LeafMask, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
     out: list[DoorState] = []
-    looks, contradicted = {"shut": 0, "open": 0}, 0
+    counts, contradicted = {"shut": 0, "open": 0}, 0
     bins = (stamp_ns[hits[:, 0]] - stamp_ns[0]) // _BIN_NS
-    for one in group_indices(bins):
-        scans, number = hits[one].T
+    for second in group_indices(bins):
+        scans, number = hits[second].T
         number = np.unique(number)
         n_shut = int(np.count_nonzero(number < mask.n_shut))
         shares = {"shut": n_shut / mask.n_shut, "open": (len(number) - n_shut) / mask.n_open}
@@ -128,13 +128,13 @@ def _list_states(mask: _LeafMask, hits: Int64, stamp_ns: Int64) -> tuple[DoorSta
         position: Position = "shut" if shares["shut"] >= shares["open"] else "open"
         if shares[position] < max(_MIN_SHARE, _RATIO * min(shares.values())):
             continue
-        looks[position] += 1
+        counts[position] += 1
         first, last = int(stamp_ns[scans.min()]), int(stamp_ns[scans.max()])
         if out and out[-1].position == position:
             first = out.pop().since_ns
         out.append(DoorState(position, first, last))
     # a single one may be of somebody who walks by; a leaf is not in two positions
-    swings = min(looks.values()) >= max(_MIN_LOOKS, contradicted)
+    swings = min(counts.values()) >= max(_MIN_OBSERVATIONS, contradicted)
     return tuple(out) if swings else ()
 
 
@@ -143,8 +143,8 @@ def is_passage_observed(door: Door, recording: Recording, poses: Float) -> bool:
 
     Two sides of a box that are seen in turn look like a leaf otherwise.
     """
-    other: tuple[tuple[Position, float], ...] = (("open", door.shut), ("shut", door.opened))
-    for position, direction in other:
+    positions: tuple[tuple[Position, float], ...] = (("open", door.shut), ("shut", door.opened))
+    for position, direction in positions:
         scans = _scans_during(door, position, recording.stamp_ns)
         along = np.array([np.cos(direction), np.sin(direction)])
         ends = np.array(door.hinge) + door.length * np.array(_CROSSED)[:, None] * along
@@ -153,7 +153,7 @@ def is_passage_observed(door: Door, recording: Recording, poses: Float) -> bool:
     return False
 
 
-def observe_passages(ends: Float, looks: Int64, recording: Recording, poses: Float) -> Index:
+def observe_passages(ends: Float, observations: Int64, recording: Recording, poses: Float) -> Index:
     """(n,) scans whose beams passed through a leaf while nothing was seen there.
 
     None where fewer than three did, or where the leaf was never seen. At most 500 scans are looked
@@ -161,12 +161,12 @@ def observe_passages(ends: Float, looks: Int64, recording: Recording, poses: Flo
 
     Args:
         ends: (2, 2) m, of the leaf.
-        looks: (L, 2) from `observe_looks`.
+        observations: (L, 2) from `observe_leaves`.
         recording, poses: see `observe_states`.
     """
     stamp_ns = recording.stamp_ns
     seen = np.zeros(len(stamp_ns), bool)
-    for first, last in looks:
+    for first, last in observations:
         seen |= (stamp_ns >= first - _AROUND_NS) & (stamp_ns <= last + _AROUND_NS)
     sensor = recording.T_map_sensor(poses)[:, :2, 2]
     is_near = np.linalg.norm(sensor - ends.mean(axis=0), axis=1) <= _MAX_DISTANCE
@@ -175,13 +175,13 @@ def observe_passages(ends: Float, looks: Int64, recording: Recording, poses: Flo
     return scans if len(scans) >= _MIN_CROSSING else scans[:0]
 
 
-def measure_slope(ends: Float, looks: Int64, recording: Recording, poses: Float) -> float:
-    """Slope of the surface that was hit in some looks along a leaf, against it; NaN: none was.
+def measure_slope(ends: Float, observations: Int64, recording: Recording, poses: Float) -> float:
+    """Slope against a leaf of the surface that some observations hit along it; NaN: there is none.
 
     Args:
-        ends, looks, recording, poses: see `observe_passages`.
+        ends, observations, recording, poses: see `observe_passages`.
     """
-    first, last = looks[:, :1], looks[:, 1:]
+    first, last = observations[:, :1], observations[:, 1:]
     seen = ((recording.stamp_ns >= first) & (recording.stamp_ns <= last)).any(axis=0)
     beam, _ = _list_hits(_thin(np.flatnonzero(seen)), recording)
     length = float(np.linalg.norm(ends[1] - ends[0]))
@@ -191,28 +191,28 @@ def measure_slope(ends: Float, looks: Int64, recording: Recording, poses: Float)
     inner = (along > INNER[0] * length) & (along < INNER[1] * length) & (np.abs(across) < _ASIDE)
     if np.count_nonzero(inner) < 2:
         return math.nan
-    x, y = (one[inner] - one[inner].mean() for one in (along, across))
+    x, y = (axis[inner] - axis[inner].mean() for axis in (along, across))
     return float((x @ y) / max(x @ x, np.finfo(np.float64).tiny))
 
 
-def list_runs(position: Position, looks: Int64, passages: Int64) -> tuple[DoorState, ...]:
-    """States of a leaf seen in one position in looks (L, 2), and not there at stamps (n,)."""
-    other: Position = "shut" if position == "open" else "open"
-    seen = [DoorState(position, first, last) for first, last in looks.tolist()]
-    seen += [DoorState(other, stamp, stamp) for stamp in passages.tolist()]
+def list_runs(position: Position, observations: Int64, passages: Int64) -> tuple[DoorState, ...]:
+    """States of a leaf seen in one position at stamps (L, 2), and not there at stamps (n,)."""
+    opposite: Position = "shut" if position == "open" else "open"
+    seen = [DoorState(position, first, last) for first, last in observations.tolist()]
+    seen += [DoorState(opposite, stamp, stamp) for stamp in passages.tolist()]
     out: list[DoorState] = []
-    for one in sorted(seen, key=lambda state: state.since_ns):
-        same = bool(out) and out[-1].position == one.position
-        out.append(one._replace(since_ns=out.pop().since_ns) if same else one)
+    for state in sorted(seen, key=lambda state: state.since_ns):
+        same = bool(out) and out[-1].position == state.position
+        out.append(state._replace(since_ns=out.pop().since_ns) if same else state)
     return tuple(out)
 
 
 def _scans_during(door: Door, position: Position, stamp_ns: Int64) -> Index:
     """Scans in the states of that position, thinned evenly where there are many."""
     inside = np.zeros(len(stamp_ns), bool)
-    for one in door.states:
-        if one.position == position:
-            inside |= (stamp_ns >= one.since_ns) & (stamp_ns <= one.until_ns)
+    for state in door.states:
+        if state.position == position:
+            inside |= (stamp_ns >= state.since_ns) & (stamp_ns <= state.until_ns)
     return _thin(np.flatnonzero(inside))
 
 
@@ -242,7 +242,7 @@ def _find_crossing(ends: Float, scans: Index, recording: Recording, poses: Float
     T = recording.T_map_sensor(poses)[scans]
     start, end = T[of, :2, 2], recording.end_points(beam, poses)
     a, b = ends
-    side = np.stack([_cross(end - start, one - start) for one in (a, b)])
+    side = np.stack([_cross(end - start, post - start) for post in (a, b)])
     beyond = _cross(b - a, end - a) * np.sign(_cross(b - a, start - a))
     # by so far that noise does not reach back
     passes = (side.prod(axis=0) < 0.0) & (beyond < -_GOES_ON * np.linalg.norm(b - a))
@@ -250,5 +250,5 @@ def _find_crossing(ends: Float, scans: Index, recording: Recording, poses: Float
     return crossing
 
 
-def _cross(one: Float, other: Float) -> Float:
-    return np.asarray(one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0])
+def _cross(a: Float, b: Float) -> Float:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

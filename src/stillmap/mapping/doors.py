@@ -181,6 +181,6 @@ class Door(ShortRepr):
         if state == "last" or len(self.states) == 1:
             return self.states[-1].position
         seconds = {"open": 0, "shut": 0}
-        for one in self.states:
-            seconds[one.position] += one.until_ns - one.since_ns
+        for past in self.states:
+            seconds[past.position] += past.until_ns - past.since_ns
         return "open" if seconds["open"] >= seconds["shut"] else "shut"

@@ -92,7 +92,7 @@ def _find_directions(cells: Cells, resolution: float) -> Float:
     across = np.round(cells @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ unit.T).astype(np.int64)
     rows = map(_count_in_rows, across.T)
     # cells beside each other in rows of walls, of which each direction has some by chance
-    wall = np.array([np.sum(one[one >= _MIN_WALL / resolution] ** 2.0) for one in rows])
+    wall = np.array([np.sum(count[count >= _MIN_WALL / resolution] ** 2.0) for count in rows])
     wall -= wall.min()
     around = np.stack([np.roll(wall, k) for k in range(-_NEAR, _NEAR + 1)])
     kept = (wall == around.max(axis=0)) & (wall >= max(_MIN_SHARE * wall.max(), 1))

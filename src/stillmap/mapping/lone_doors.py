@@ -22,7 +22,7 @@ from stillmap.mapping.door_states import (
     find_hit_cells,
     list_runs,
     measure_slope,
-    observe_looks,
+    observe_leaves,
     observe_passages,
 )
 from stillmap.mapping.doors import Door, DoorState
@@ -36,25 +36,25 @@ from stillmap.mapping.doorways import (
 from stillmap.mapping.lone_leaves import find_open_leaf, is_doorway_free, is_thin
 
 _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
-_WATCHED = 2.0  # s between two looks within which a swing would have been seen
+_WATCHED = 2.0  # s between two observations within which a swing would have been seen
 _LEAST = 1e-3  # s that a swing takes
 
 
 def compute_p_moved(
-    doors: Sequence[Door], looks: Sequence[Int64], stamp_ns: Int64
+    doors: Sequence[Door], observations: Sequence[Int64], stamp_ns: Int64
 ) -> tuple[Float, Float]:
-    """Probability that each of some doors was in the same position at all looks, (K,), and if it
-    was, that it moved while nobody saw it, (K,).
+    """Probability that each of some doors was in the same position in all observations, (K,), and
+    if it was, that it moved while nobody saw it, (K,).
 
     A door swings at a constant rate, the same for all of them. The two positions of a door that
     swung at the rate r differ after t with probability (1 - exp(-2 r t)) / 2.
 
     Args:
         doors: those that were seen to swing.
-        looks: (L, 2) of each of the others, see `observe_looks`.
+        observations: (L, 2) of each of the others, see `observe_leaves`.
         stamp_ns: (T,) of the recording.
     """
-    spans = [_split_looks(one) for one in looks]
+    spans = [_split_observations(stamps) for stamps in observations]
     log_same = [
         np.log(0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, gaps)))).sum(axis=1) - _RATES * watched
         for watched, gaps in spans
@@ -63,9 +63,9 @@ def compute_p_moved(
     log_likelihood = np.sum([np.zeros(len(_RATES)), *swings, *log_same], axis=0)
     posterior = _normalize(log_likelihood)
     # by the rate that all others tell
-    same = [float(_normalize(log_likelihood - one) @ np.exp(one)) for one in log_same]
+    same = [float(_normalize(log_likelihood - own) @ np.exp(own)) for own in log_same]
     moved = []
-    for stamps, (_, gaps) in zip(looks, spans, strict=True):
+    for stamps, (_, gaps) in zip(observations, spans, strict=True):
         ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
         # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
         log_still = -_RATES * ends - np.logaddexp(
@@ -88,14 +88,16 @@ def _log_likelihood_of_swings(door: Door) -> Float:
     Each state lasts from the first to the last time the leaf was seen so; it may have moved to and
     fro meanwhile.
     """
-    since, until = 1e-9 * np.array([[one.since_ns, one.until_ns] for one in door.states], float).T
+    since, until = (
+        1e-9 * np.array([[state.since_ns, state.until_ns] for state in door.states], float).T
+    )
     between = np.maximum(since[1:] - until[:-1], _LEAST)
     differs = 0.5 * -np.expm1(-2.0 * np.outer(_RATES, between))
     same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, until - since)))
     return np.asarray(np.log(differs).sum(axis=1) + np.log(same).sum(axis=1))
 
 
-def _split_looks(stamps: Int64) -> tuple[float, Float]:
+def _split_observations(stamps: Int64) -> tuple[float, Float]:
     """Seconds in which a leaf was watched, and the gaps between them."""
     pauses = 1e-9 * (stamps[1:, 0] - stamps[:-1, 1]).astype(np.float64)
     watched = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum()) + float(
@@ -146,15 +148,15 @@ def find_lone_doors(
         )
         if leaf is not None and len(leaf.cells)  # of coarse cells, all may be at the wall
     ]
-    taken = [one.swept_cells for one in doors]
-    found: list[tuple[LoneLeaf, bool]] = []
-    for leaf, is_open in sorted(left, key=lambda one: not one[1]):
+    taken = [door.swept_cells for door in doors]
+    leaves: list[tuple[LoneLeaf, bool]] = []
+    for leaf, is_open in sorted(left, key=lambda lone: not lone[1]):
         if (not is_open or is_thin(leaf, counts)) and not any(
             _is_part(leaf.cells, cells) for cells in taken
         ):
             taken.append(leaf.cells)
-            found.append((leaf, is_open))
-    return _observe(found, doors, recording, poses, resolution)
+            leaves.append((leaf, is_open))
+    return _observe(leaves, doors, recording, poses, resolution)
 
 
 def _count_beams(
@@ -174,59 +176,61 @@ def _count_beams(
 
 
 def _observe(
-    found: Sequence[tuple[LoneLeaf, bool]],
+    leaves: Sequence[tuple[LoneLeaf, bool]],
     doors: Sequence[Door],
     recording: Recording,
     poses: Float,
     resolution: float,
 ) -> list[Door]:
     """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
-    looks = observe_looks([leaf.cells for leaf, _ in found], recording, poses, resolution)
-    passed_doors, lone_doors, lone_looks = list[Door](), list[Door](), list[Int64]()
-    for (leaf, is_open), seen in zip(found, looks, strict=True):
+    observations = observe_leaves([leaf.cells for leaf, _ in leaves], recording, poses, resolution)
+    passed_doors, lone_doors, lone_observations = list[Door](), list[Door](), list[Int64]()
+    for (leaf, is_open), seen in zip(leaves, observations, strict=True):
         if not len(seen):
             continue
         passed = np.empty(0, np.intp)
         if not is_open:
             leaf, passed = _find_passages(leaf, seen, recording, poses, resolution)
         states = list_runs("open" if is_open else "shut", seen, recording.stamp_ns[passed])
-        one = _make_door(leaf, is_open, resolution, states)
+        door = _make_door(leaf, is_open, resolution, states)
         if len(passed):
-            passed_doors.append(one)
+            passed_doors.append(door)
         else:
-            lone_doors.append(one)
-            lone_looks.append(seen)
-    lone_doors = _rate_lone(lone_doors, lone_looks, [*doors, *passed_doors], recording.stamp_ns)
+            lone_doors.append(door)
+            lone_observations.append(seen)
+    lone_doors = _rate_lone(
+        lone_doors, lone_observations, [*doors, *passed_doors], recording.stamp_ns
+    )
     return [*passed_doors, *lone_doors]
 
 
 def _find_passages(
-    leaf: LoneLeaf, looks: Int64, recording: Recording, poses: Float, resolution: float
+    leaf: LoneLeaf, observations: Int64, recording: Recording, poses: Float, resolution: float
 ) -> tuple[LoneLeaf, Index]:
     """A shut leaf without what is hit while beams pass through it, and the scans of these.
 
     What is hit then is the edge of a wall; where little else is left, it is no leaf that moved. Nor
-    is it one if the surface that the looks saw does not lie along the doorway.
+    is it one if the surface that was seen there does not lie along the doorway.
     """
     ends = resolution * (leaf.hinge + 0.5 + np.outer([0.0, leaf.length], leaf.shut))
-    scans = observe_passages(ends, looks, recording, poses)
+    scans = observe_passages(ends, observations, recording, poses)
     hit = find_hit_cells(scans, recording, poses, resolution)
     moved = leaf._replace(cells=leaf.cells[~np.isin(cell_keys(leaf.cells), cell_keys(hit))])
     along = np.round((moved.cells - leaf.hinge) @ leaf.shut)
     inner = np.arange(math.ceil(INNER[0] * leaf.length), INNER[1] * leaf.length)
     if np.isin(inner, along).mean() < _MIN_MOVED:
         return leaf, scans[:0]
-    if not abs(measure_slope(ends, looks, recording, poses)) <= _MAX_SLOPE:
+    if not abs(measure_slope(ends, observations, recording, poses)) <= _MAX_SLOPE:
         return leaf, scans[:0]
     return moved, scans
 
 
 def _rate_lone(
-    lone: Sequence[Door], looks: Sequence[Int64], swung: Sequence[Door], stamp_ns: Int64
+    lone: Sequence[Door], observations: Sequence[Int64], swung: Sequence[Door], stamp_ns: Int64
 ) -> list[Door]:
     """The doors seen in one position with P(moved), without those that hardly are doors."""
-    is_open = np.array([len(one.open_cells) > 0 for one in lone], bool)
-    same, moved = compute_p_moved(swung, looks, stamp_ns)
+    is_open = np.array([len(door.open_cells) > 0 for door in lone], bool)
+    same, moved = compute_p_moved(swung, observations, stamp_ns)
     p_door = np.full(len(lone), _P_LEAF)
     p_door[~is_open] = estimate_p_door(
         estimate_shut_share(swung) * same[~is_open], len(swung) + int(is_open.sum())
@@ -285,18 +289,18 @@ def relabel_lone_doors(
         state: state of changed places that the map shows.
         threads: number of threads; the result does not depend on it.
     """
-    doors = [one for one in doors if len(one.open_cells) or len(one.states) > 1]
+    doors = [door for door in doors if len(door.open_cells) or len(door.states) > 1]
     if not doors:
         return p_static, occupied
     keys, p_moved = cell_keys(histories.cells), np.zeros(len(histories.cells), np.float32)
     p_occupied = occupied.p_occupied.copy()
-    for one in doors:
-        is_open = len(one.open_cells) > 0
-        on_leaf = np.isin(keys, cell_keys(one.open_cells if is_open else one.shut_cells))
-        p_moved[on_leaf] = np.maximum(p_moved[on_leaf], one.p_moved)
-        if one.position_in(state) != ("open" if is_open else "shut"):
+    for door in doors:
+        is_open = len(door.open_cells) > 0
+        on_leaf = np.isin(keys, cell_keys(door.open_cells if is_open else door.shut_cells))
+        p_moved[on_leaf] = np.maximum(p_moved[on_leaf], door.p_moved)
+        if door.position_in(state) != ("open" if is_open else "shut"):
             p_occupied[on_leaf] = 0.0
-        elif len(one.states) > 1:  # of what moved all cells are shown
+        elif len(door.states) > 1:  # of what moved all cells are shown
             p_occupied[on_leaf] = histories.p_in_cell[on_leaf]
     out = arrays.copy(p_static, recording.scratch)
     for _, beams, data in iter_beams(recording, poses, release=[out]):

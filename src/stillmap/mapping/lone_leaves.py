@@ -67,28 +67,28 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
     return leaf if leaf.roughness <= _ROUGHNESS + _MORE_ROUGHNESS else None
 
 
-def _goes_on(one: LoneLeaf, surface: Cells) -> bool:
+def _goes_on(leaf: LoneLeaf, surface: Cells) -> bool:
     """True if the surface of a leaf goes on behind the hinge."""
-    along, across = _along_and_across(one, surface)
+    along, across = _along_and_across(leaf, surface)
     behind = (along < -_BEHIND_WALL) & (along > -_BEHIND_WALL - _GOES_ON)
     row = np.unique(np.round(along[behind & (np.abs(across) <= 1.5)]))
     return len(row) > _MAX_GOES_ON
 
 
-def _measure_roughness(one: LoneLeaf, surface: Cells) -> float:
+def _measure_roughness(leaf: LoneLeaf, surface: Cells) -> float:
     """Standard deviation of the surface of a leaf from a line, cells."""
-    along, across = _along_and_across(one, surface)
-    of_leaf = (along > _NEAR_HINGE * one.length) & (along < one.length)
+    along, across = _along_and_across(leaf, surface)
+    of_leaf = (along > _NEAR_HINGE * leaf.length) & (along < leaf.length)
     of_leaf &= np.abs(across) <= _BAND
     line = np.column_stack([along[of_leaf], np.ones(np.count_nonzero(of_leaf))])
     fitted = line @ np.linalg.lstsq(line, across[of_leaf], rcond=None)[0]
     return float(np.sqrt(np.mean((across[of_leaf] - fitted) ** 2)))
 
 
-def _along_and_across(one: LoneLeaf, cells: Cells) -> tuple[Float, Float]:
+def _along_and_across(leaf: LoneLeaf, cells: Cells) -> tuple[Float, Float]:
     """Coordinates of cells from the hinge of a leaf, along it and across."""
-    off = cells - one.hinge
-    return off @ one.leaf, off @ np.array([-one.leaf[1], one.leaf[0]])
+    off = cells - leaf.hinge
+    return off @ leaf.leaf, off @ np.array([-leaf.leaf[1], leaf.leaf[0]])
 
 
 def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
@@ -97,18 +97,18 @@ def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
     return _passed_share(counts, gap) >= _MIN_PASSED
 
 
-def is_thin(one: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
+def is_thin(leaf: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
     """True if beams passed on both sides of a leaf, the more the rougher it is; `counts` as for
     `is_doorway_free`."""
-    across = np.array([-one.leaf[1], one.leaf[0]])
-    if across @ one.shut < 0.0:
+    across = np.array([-leaf.leaf[1], leaf.leaf[0]])
+    if across @ leaf.shut < 0.0:
         across = -across
-    t = np.arange(_NEAR_HINGE * one.length + 1.0, one.length)
-    row = one.hinge + t[:, None] * one.leaf
+    t = np.arange(_NEAR_HINGE * leaf.length + 1.0, leaf.length)
+    row = leaf.hinge + t[:, None] * leaf.leaf
     inside, behind = (
         max(_passed_share(counts, row + k * side * across) for k in _BESIDE) for side in (1.0, -1.0)
     )
-    is_straight = one.roughness <= _ROUGHNESS + _MORE_ROUGHNESS * behind
+    is_straight = leaf.roughness <= _ROUGHNESS + _MORE_ROUGHNESS * behind
     return inside >= _MIN_PASSED and behind >= _MIN_BEHIND and is_straight
 
 
@@ -177,7 +177,7 @@ def _sample_leaves(
 ) -> _Hypotheses | None:
     """Those that lie on surface over the shortest length; None: there are none."""
     grids = np.meshgrid(_SHIFT, _BACK, _ANGLES, indexing="ij")
-    shift, back, angle = (one.ravel() for one in grids)
+    shift, back, angle = (grid.ravel() for grid in grids)
     hinge = end + shift[:, None] * u + back[:, None] * v
     leaf = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
     t = _along(doorway)
@@ -278,5 +278,5 @@ def _find_lines(seen: Cells, resolution: float) -> Iterator[tuple[tuple[int, ...
     part = np.round(angle / np.pi * _ANGLE).astype(np.int64) % _ANGLE
     place = np.column_stack([np.round(mean / _MIDDLE).astype(np.int64), part])
     kept = np.flatnonzero(is_line[label])
-    for one in group_indices(label[kept]):
-        yield tuple(place[label[kept[one[0]]]].tolist()), seen[kept[one], :2]
+    for members in group_indices(label[kept]):
+        yield tuple(place[label[kept[members[0]]]].tolist()), seen[kept[members], :2]

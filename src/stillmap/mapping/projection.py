@@ -164,12 +164,12 @@ def count_small_pieces(occupancy: OccupancyMap) -> float | None:
 
     A piece is a component of occupied cells, of which all eight neighbours are connected.
     """
-    known, found = 0, [np.empty((0, 2), np.int64)]
+    known, occupied = 0, [np.empty((0, 2), np.int64)]
     for (rows, columns), part in tiles_of(occupancy.p_occupied):
         known += int(np.count_nonzero(~np.isnan(part)))
         corner = np.array([rows.start or 0, columns.start or 0])
-        found.append(np.argwhere(part > _OCCUPIED) + corner)
-    cells = np.concatenate(found)
+        occupied.append(np.argwhere(part > _OCCUPIED) + corner)
+    cells = np.concatenate(occupied)
     if not len(cells):
         return None
     piece = component_labels(adjacent_pairs(cells), len(cells))

@@ -77,16 +77,16 @@ def find_mirrors(
     mirrors: list[Mirror] = []
     for normal, distance in iter_lines(surfaces.cells, resolution):
         for side in (1.0, -1.0):
-            found = list(_find_on_line(beams, surfaces, side * normal, side * distance))
-            for mirror in found:  # the lines beside would show it again
+            on_line = list(_find_on_line(beams, surfaces, side * normal, side * distance))
+            for mirror in on_line:  # the lines beside would show it again
                 beams = beams.without(mirror.find_crossing(beams.origins, beams.ends))
-            mirrors += found
+            mirrors += on_line
     return mirrors
 
 
 def find_reflections(recording: Recording, poses: Float, mirrors: list[Mirror]) -> Bool:
     """(M,) mask of the beams that mirrors reflected, with or without a return."""
-    found = np.zeros(recording.n_beams, np.bool_)
+    is_reflected = np.zeros(recording.n_beams, np.bool_)
     for _, beams, data in iter_beams(recording, poses):
         scan = np.repeat(np.arange(len(data.T_map_sensor)), np.diff(data.offset))
         T = data.T_map_sensor[scan]
@@ -95,8 +95,8 @@ def find_reflections(recording: Recording, poses: Float, mirrors: list[Mirror]) 
         usable = np.isfinite(ends[:, 0])
         ends[~usable] = origins[~usable]
         for mirror in mirrors:
-            found[beams] |= mirror.find_crossing(origins, ends)
-    return found
+            is_reflected[beams] |= mirror.find_crossing(origins, ends)
+    return is_reflected
 
 
 def _sample_beams(recording: Recording, poses: Float, p_static: Float32) -> Beams:

@@ -60,7 +60,7 @@ def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cell
             rated = _rate_leaves(field, hinge, length, -end * line.along)
             if rated is None:
                 break  # there is less of a longer one
-            best = max(best, rated, key=lambda one: one[0])
+            best = max(best, rated, key=lambda candidate: candidate[0])
     return best[1]
 
 

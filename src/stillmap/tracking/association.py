@@ -36,7 +36,7 @@ _MAX_RADIUS = 0.45  # m from the center of an object to its points
 
 
 def split_track(
-    points: DynamicPoints, owned: Index, one: Index, other: Index
+    points: DynamicPoints, owned: Index, first: Index, second: Index
 ) -> list[tuple[Index, Index]]:
     """Divide the past points of a track between the two objects that it turned out to be.
 
@@ -45,14 +45,14 @@ def split_track(
     Args:
         points: dynamic end points.
         owned: past points of the track, rising.
-        one, other: points of either object in the current scan.
+        first, second: points of either object in the current scan.
 
     Returns:
         Points in the current scan and past points of the older object, and of the newer one.
     """
     xy, seconds = points.xy, points.seconds[points.scan]
-    now = float(seconds[one[0]])
-    centroids = np.array([xy[one].mean(axis=0), xy[other].mean(axis=0)])
+    now = float(seconds[first[0]])
+    centroids = np.array([xy[first].mean(axis=0), xy[second].mean(axis=0)])
     states = kalman.initialize(centroids, _POSITION_STD)
     seen = np.array([now, now])
     shares: tuple[list[Index], list[Index]] = ([owned[:0]], [owned[:0]])
@@ -70,7 +70,7 @@ def split_track(
         seen[count > 0] = now
         for i in (0, 1):
             shares[i].append(here[nearest == i])
-    parts = [(one, np.concatenate(shares[0])), (other, np.concatenate(shares[1]))]
+    parts = [(first, np.concatenate(shares[0])), (second, np.concatenate(shares[1]))]
     return parts[::-1] if seen[1] < seen[0] else parts
 
 
@@ -155,10 +155,10 @@ class _Tracker:
         every = np.ones(len(sigma), bool)
         claims = self._nearest(xy, _GATE, every)
         if (claims == NO_TRACK).any():
-            found = np.bincount(claims[claims >= 0], minlength=len(sigma)) > 0
+            claiming = np.bincount(claims[claims >= 0], minlength=len(sigma)) > 0
             taken = np.bincount(cluster[claims >= 0], minlength=cluster[-1] + 1) > 0
             open_to = np.flatnonzero((claims == NO_TRACK) & ~taken[cluster])
-            claims[open_to] = self._nearest(xy[open_to], _WIDE_GATE, ~found)
+            claims[open_to] = self._nearest(xy[open_to], _WIDE_GATE, ~claiming)
             claims = _complete_clusters(claims, cluster, len(sigma))
         return claims
 
@@ -336,9 +336,9 @@ def _connect(parts: list[Float], max_distance: float) -> tuple[list[int], list[i
     return kept, gone
 
 
-def _distance(one: Float, other: Float) -> float:
+def _distance(first: Float, second: Float) -> float:
     """Between the nearest points of two sets (n, 2) and (m, 2): few, as of one cluster."""
-    squared = sum((one[:, None, d] - other[None, :, d]) ** 2 for d in (0, 1))
+    squared = sum((first[:, None, d] - second[None, :, d]) ** 2 for d in (0, 1))
     return float(np.sqrt(np.min(squared)))
 
 

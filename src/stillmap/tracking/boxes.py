@@ -83,10 +83,10 @@ def fit_boxes(
     """
     start = int(recording.stamp_ns[0])
     points = extract_dynamic_points(recording, poses, p_static, min_p_dynamic)
-    owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
+    owned = np.concatenate([np.zeros(0, np.intp), *(mover.beams for mover in objects)])
     rest = ~np.isin(points.beam, owned)
     xy, scan = points.xy[rest], points.scan[rest]
-    out = [fit_box(one, start, hold) for one in objects]
+    out = [fit_box(mover, start, hold) for mover in objects]
     _, first, count = np.unique(points.cluster[rest], return_index=True, return_counts=True)
     for a, n in zip(first.tolist(), count.tolist(), strict=True):
         if n >= _MIN_POINTS:
@@ -95,25 +95,27 @@ def fit_boxes(
     return out
 
 
-def fit_box(one: MovingObject, start: int, hold: float) -> Box:
+def fit_box(mover: MovingObject, start: int, hold: float) -> Box:
     """The box of an object.
 
     Args:
-        one: the object.
+        mover: the object.
         start: ns, time 0 of the box.
         hold: s for which it persists before its first and after its last detection.
     """
-    seconds = np.asarray(1e-9 * (one.stamp_ns - start), np.float64)
-    speed = np.linalg.norm(one.velocity, axis=1)
+    seconds = np.asarray(1e-9 * (mover.stamp_ns - start), np.float64)
+    speed = np.linalg.norm(mover.velocity, axis=1)
     moving = np.flatnonzero(speed > HEADING_SPEED)
-    half = (0.5 * one.size[0], 0.5 * one.size[1])
+    half = (0.5 * mover.size[0], 0.5 * mover.size[1])
     if not len(moving):  # its heading is unknown
         heading = np.tile([1.0, 0.0], (len(seconds), 1))
-        return Box(one.id, seconds, one.xy, heading, one.velocity, (max(half), max(half)), hold)
+        return Box(
+            mover.id, seconds, mover.xy, heading, mover.velocity, (max(half), max(half)), hold
+        )
     # at rest it keeps the heading of its last motion
     at = moving[np.clip(np.searchsorted(moving, np.arange(len(speed)), "right") - 1, 0, None)]
-    heading = one.velocity[at] / speed[at, None]
-    return Box(one.id, seconds, one.xy, heading, one.velocity, half, hold)
+    heading = mover.velocity[at] / speed[at, None]
+    return Box(mover.id, seconds, mover.xy, heading, mover.velocity, half, hold)
 
 
 def _fit_static_box(xy: Float, seconds: Float) -> Box:

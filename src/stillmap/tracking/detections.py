@@ -43,20 +43,20 @@ def compute_centroids(points: DynamicPoints, owner: Index, here: slice | Index) 
 def collect_centroids(points: DynamicPoints, owner: Index) -> Centroids:
     """Centroids of all points."""
     blocks = [compute_centroids(points, owner, here) for here in scan_blocks(points, owner)]
-    found = Centroids._make(np.concatenate(column) for column in zip(*blocks, strict=True))
-    order = np.argsort(found.track, kind="stable")  # blocks follow each other in time
-    return Centroids._make(column[order] for column in found)
+    centroids = Centroids._make(np.concatenate(column) for column in zip(*blocks, strict=True))
+    order = np.argsort(centroids.track, kind="stable")  # blocks follow each other in time
+    return Centroids._make(column[order] for column in centroids)
 
 
-def measure_widths(points: DynamicPoints, found: Centroids) -> Float:
+def measure_widths(points: DynamicPoints, centroids: Centroids) -> Float:
     """(L,) metres across the line of sight that the beams of a centroid cover."""
     some = slice(0, _MANY)
     bearing = np.arctan2(*(points.xy[some] - points.sensor[points.scan[some]]).T[::-1])
     turn = np.abs((np.diff(bearing) + np.pi) % (2.0 * np.pi) - np.pi)
     adjacent = (np.diff(points.beam[some]) == 1) & (np.diff(points.cluster[some]) == 0)
     between = float(np.median(turn[adjacent])) if adjacent.any() else 0.0
-    distance = np.linalg.norm(found.xy - points.sensor[found.scan], axis=1)
-    return np.asarray(found.hits * between * distance)
+    distance = np.linalg.norm(centroids.xy - points.sensor[centroids.scan], axis=1)
+    return np.asarray(centroids.hits * between * distance)
 
 
 def find_near_pairs(scan: Index, xy: Float, max_distance: float) -> Index:

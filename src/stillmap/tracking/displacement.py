@@ -19,8 +19,8 @@ from stillmap.tracking.objects import MovingObject
 _MIN_TRAVEL = 0.5  # m: errors of the poses and visible parts move what stands by less
 _RADIUS = 0.4  # m around the center of what stands, that count as its place
 _HALF_HEIGHT = 0.2  # m, at least, of its place above and below the center
-_LOOK_TIME, _LOOKS = 3.0, 4  # s before the first detection and after the last; looks there at most
-_MIN_BEAMS = 5  # that reach a place, for a look
+_VIEW_TIME, _VIEWS = 3.0, 4  # s before the first detection and after the last; views there at most
+_MIN_BEAMS = 5  # that reach a place, for a view
 _BEFORE, _AFTER, _DURING = 0, 1, 2
 _MIN_HALF_SIZE = 0.05  # m, of the outline of a thin or flat object
 _MAX_P_MISSED = 0.05  # that an object which is still there stops no beam
@@ -37,13 +37,15 @@ def select_movers(
         recording: 3D, deskewed.
         poses: (T, 4, 4) T_map_base.
     """
-    standing = [one for one in objects if np.linalg.norm(np.ptp(one.xy, axis=0)) < _MIN_TRAVEL]
+    standing = [
+        mover for mover in objects if np.linalg.norm(np.ptp(mover.xy, axis=0)) < _MIN_TRAVEL
+    ]
     clutter = _remain_occupied(standing, recording, poses)
-    kept = [one for one in objects if one.id not in clutter]
-    return [dataclasses.replace(one, id=number) for number, one in enumerate(kept)]
+    kept = [mover for mover in objects if mover.id not in clutter]
+    return [dataclasses.replace(mover, id=number) for number, mover in enumerate(kept)]
 
 
-class _Look(NamedTuple):
+class _PlaceView(NamedTuple):
     """Beams of a scan that reach a place.
 
     Attributes:
@@ -63,61 +65,63 @@ def _remain_occupied(
     standing: Sequence[MovingObject], recording: Recording, poses: Float
 ) -> set[int]:
     """Ids of those whose place is not seen empty, neither before nor after."""
-    looks: dict[int, list[tuple[int, int]]] = defaultdict(list)  # by scan: object, time
-    for k, one in enumerate(standing):
-        for time, scans in enumerate(_choose_looks(one, recording.stamp_ns)):
+    by_scan: dict[int, list[tuple[int, int]]] = defaultdict(list)  # by scan: object, time
+    for k, mover in enumerate(standing):
+        for time, scans in enumerate(_choose_scans(mover, recording.stamp_ns)):
             for t in scans.tolist():
-                looks[t].append((k, time))
-    found: dict[tuple[int, int], list[_Look]] = defaultdict(list)
+                by_scan[t].append((k, time))
+    views: dict[tuple[int, int], list[_PlaceView]] = defaultdict(list)
     T_map_sensor = recording.T_map_sensor(poses)
-    for t in recording.iter_scans(sorted(looks)):
+    for t in recording.iter_scans(sorted(by_scan)):
         beams = recording.beams_of(t)
         points = recording.points[beams].compress(recording.hit[beams], axis=0).astype(np.float64)
         ends = points @ T_map_sensor[t, :3, :3].T
         flat = np.ascontiguousarray(ends[:, :2].T)
         length = np.sqrt(np.square(flat[0]) + np.square(flat[1]))
-        for k, time in looks[t]:
+        for k, time in by_scan[t]:
             place = _place(standing[k]) - T_map_sensor[t, :3, 3]
             near = _find_near_line(flat, length, place)
-            found[k, time].append(_look_at(ends[near], place, standing[k].size))
+            views[k, time].append(_view_place(ends[near], place, standing[k].size))
     return {
-        one.id
-        for k, one in enumerate(standing)
-        if not any(_is_empty(found[k, side], found[k, _DURING]) for side in (_BEFORE, _AFTER))
+        mover.id
+        for k, mover in enumerate(standing)
+        if not any(_is_empty(views[k, side], views[k, _DURING]) for side in (_BEFORE, _AFTER))
     }
 
 
-def _is_empty(looks: Sequence[_Look], during: Sequence[_Look]) -> bool:
-    """True if other looks show that the object of the looks `during` its track is not there.
+def _is_empty(views: Sequence[_PlaceView], during: Sequence[_PlaceView]) -> bool:
+    """True if other views show that the object of the views `during` its track is not there.
 
-    Most looks see all beams pass, and so many of them within its outline that the object, which
+    Most views see all beams pass, and so many of them within its outline that the object, which
     stopped a share of such beams, would have stopped one.
     """
-    looks = [one for one in looks if one.around >= _MIN_BEAMS]
-    passed = [one for one in looks if not one.stopped]
-    through, inside = (sum(getattr(one, name) for one in during) for name in ("through", "inside"))
+    views = [view for view in views if view.around >= _MIN_BEAMS]
+    passed = [view for view in views if not view.stopped]
+    through, inside = (
+        sum(getattr(view, name) for view in during) for name in ("through", "inside")
+    )
     p_pass = 1.0 - inside / max(through, 1)
-    expected = sum(one.through for one in passed)
-    return 2 * len(passed) > len(looks) and p_pass**expected < _MAX_P_MISSED
+    expected = sum(view.through for view in passed)
+    return 2 * len(passed) > len(views) and p_pass**expected < _MAX_P_MISSED
 
 
-def _choose_looks(one: MovingObject, stamp_ns: Int64) -> tuple[Index, Index, Index]:
+def _choose_scans(mover: MovingObject, stamp_ns: Int64) -> tuple[Index, Index, Index]:
     """Scans before the first detection, after the last, and some with a detection."""
-    reach = round(1e9 * _LOOK_TIME)
-    first, last = np.searchsorted(stamp_ns, [one.stamp_ns[0] - reach, one.stamp_ns[-1] + reach])
-    times = np.arange(first, one.scan[0]), np.arange(one.scan[-1] + 1, last), one.scan
-    before, after, during = (scans[:: max(1, -(-len(scans) // _LOOKS))] for scans in times)
+    reach = round(1e9 * _VIEW_TIME)
+    first, last = np.searchsorted(stamp_ns, [mover.stamp_ns[0] - reach, mover.stamp_ns[-1] + reach])
+    times = np.arange(first, mover.scan[0]), np.arange(mover.scan[-1] + 1, last), mover.scan
+    before, after, during = (scans[:: max(1, -(-len(scans) // _VIEWS))] for scans in times)
     return before, after, during
 
 
-def _place(one: MovingObject) -> Float:
+def _place(mover: MovingObject) -> Float:
     """(3,) mean center in the map frame, metres."""
-    assert one.z is not None
-    return np.array([*one.xy.mean(axis=0), one.z.mean()])
+    assert mover.z is not None
+    return np.array([*mover.xy.mean(axis=0), mover.z.mean()])
 
 
 def _find_near_line(flat: Float, length: Float, place: Float) -> Index:
-    """The beams that may come near a place, in the plane; `_look_at` decides for these few.
+    """The beams that may come near a place, in the plane; `_view_place` decides for these few.
 
     Args:
         flat: (2, N) ends from the sensor.
@@ -128,7 +132,7 @@ def _find_near_line(flat: Float, length: Float, place: Float) -> Index:
     return np.flatnonzero(across <= (_RADIUS + _ROUNDING) * (length + _ROUNDING))
 
 
-def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:
+def _view_place(ends: Float, place: Float, size: Sequence[float]) -> _PlaceView:
     """Count the beams of a scan that reach the place of an object, and those that end there.
 
     Args:
@@ -145,7 +149,7 @@ def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:
     passes = length > along + _RADIUS
     width = max(0.5 * min(size[:2]), _MIN_HALF_SIZE)
     within = towards & (off < width) & (height < max(0.5 * size[2], _MIN_HALF_SIZE))
-    return _Look(
+    return _PlaceView(
         int(np.count_nonzero(towards)),
         int(np.count_nonzero(towards & ~passes)),
         int(np.count_nonzero(within)),
@@ -153,7 +157,7 @@ def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:
     )
 
 
-_LOOKS_ATTACHMENT = 4  # scans of a track that are evaluated
+_VIEWS_OF_SURFACE = 4  # scans of a track that are evaluated
 _NEIGHBORS = 8  # of a beam: the ring around it in an image
 _MAX_STEP = 0.15  # m between the ranges of neighbors on one surface
 _MARGIN = 0.03  # rad around an object, within which the neighbors of its beams are searched
@@ -172,7 +176,7 @@ def drop_surface_parts(
     """
     counts = count_neighbors(objects, recording, p_static)
     attached = counts[:, 0] > _MAX_ATTACHMENT * np.maximum(counts.sum(axis=1), _MIN_BEAMS)
-    return [one for one, is_part in zip(objects, attached, strict=True) if not is_part]
+    return [mover for mover, is_part in zip(objects, attached, strict=True) if not is_part]
 
 
 def count_neighbors(
@@ -184,11 +188,11 @@ def count_neighbors(
     and before it do not count.
     """
     counts = np.zeros((len(objects), 2), np.int64)
-    looks: dict[int, list[int]] = defaultdict(list)  # by scan: objects
-    for k, one in enumerate(objects):
-        for t in one.scan[:: -(-len(one.scan) // _LOOKS_ATTACHMENT)].tolist():
-            looks[t].append(k)
-    for t in recording.iter_scans(sorted(looks), p_static):
+    by_scan: dict[int, list[int]] = defaultdict(list)  # by scan: objects
+    for k, mover in enumerate(objects):
+        for t in mover.scan[:: -(-len(mover.scan) // _VIEWS_OF_SURFACE)].tolist():
+            by_scan[t].append(k)
+    for t in recording.iter_scans(sorted(by_scan), p_static):
         beams = recording.beams_of(t)
         numbers = beams.start + np.flatnonzero(recording.hit[beams])
         # `take` is several times as fast as an index where rows are short
@@ -197,7 +201,7 @@ def count_neighbors(
         ranges = np.sqrt(x * x + y * y + z * z)
         directions /= np.maximum(ranges, 1e-9)[:, None]
         is_static = p_static[numbers] >= 0.5
-        for k in looks[t]:
+        for k in by_scan[t]:
             own = _find_own(numbers, objects[k].beams)
             counts[k] += _count_beside(directions, ranges, own, is_static)
     return counts

@@ -153,7 +153,7 @@ def find_mover_hits(
     half += np.where(is_round, _MARGIN_OF_WALKERS, _MARGIN)[:, None]
     begins = np.flatnonzero(np.diff(scan, prepend=-1))
     rows = np.split(np.arange(len(scan)), begins[1:])
-    found = []
+    hits = []
     T_map_sensor = recording.T_map_sensor(poses)
     for k in recording.iter_scans(range(len(rows))):
         row, t = rows[k], int(scan[rows[k][0]])
@@ -168,8 +168,8 @@ def find_mover_hits(
         likeliest = weights.argmax(axis=1)
         weight = weights[np.arange(len(beam)), likeliest]
         kept = weight > 0.0
-        found.append((beam[kept], number[row[likeliest[kept]]], weight[kept]))
-    return MoverHits(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        hits.append((beam[kept], number[row[likeliest[kept]]], weight[kept]))
+    return MoverHits(*(np.concatenate(column) for column in zip(*hits, strict=True)))
 
 
 def _static_hits(recording: Recording, poses: Float, p_static: Float32, places: Int64) -> Float:
@@ -179,14 +179,14 @@ def _static_hits(recording: Recording, poses: Float, p_static: Float32, places: 
         beam = block.start + np.flatnonzero(recording.hit[block] & ~np.isnan(p_static[block]))
         key = cell_keys(np.floor(recording.end_points(beam, poses) / _CELL).astype(np.int64))
         at = np.minimum(np.searchsorted(places, key), len(places) - 1)
-        found = places[at] == key
-        out += np.bincount(at[found], p_static[beam[found]], minlength=len(places))
+        is_at = places[at] == key
+        out += np.bincount(at[is_at], p_static[beam[is_at]], minlength=len(places))
     return out
 
 
 _MIN_P_MOVER = 0.99  # what explains hits must be certain: clutter would make more of itself
 _WIDTH = 0.5  # m, of a person
-_MIN_TRAVEL, _MIN_LOOKS = 1.5, 5  # m, several times that; looks
+_MIN_TRAVEL, _MIN_DETECTIONS = 1.5, 5  # m, several times that; detections
 
 
 def iterate_walker_paths(
@@ -203,9 +203,9 @@ def iterate_walker_paths(
     for track, here in iterate_tracks(points, owner):
         if track in others or p_mover[track] <= _MIN_P_MOVER:
             continue
-        found = compute_centroids(points, owner, here)
-        scan, xy = found.scan, found.xy
-        if len(scan) < _MIN_LOOKS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
+        centroids = compute_centroids(points, owner, here)
+        scan, xy = centroids.scan, centroids.xy
+        if len(scan) < _MIN_DETECTIONS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
             continue
         at = np.searchsorted(scan, points.scan[here])
         center = xy + estimate_center_offset(xy, points.sensor[scan], points.xy[here], at)

@@ -18,11 +18,11 @@ from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.mover_path import MAX_SPEED, MIN_SPEED, MoverPath, fit_path, follow
 
 _MAX_FRAGMENT = 0.6  # s: tracks of walkers that last for longer are none
-_MAX_STEP = 0.45  # s between two looks of a seed
+_MAX_STEP = 0.45  # s between two detections of a seed
 _MAX_SCANS = 2  # from one to the next
 _DIRECTIONS = 16  # of motion, in which the edges of a cluster are known
 _GATE_ALONG, _GATE_ACROSS, _ACROSS_PER_METRE = 0.5, 0.4, 0.02  # m; beams lie apart across
-_EXTENSIONS = 3  # of a pair of clusters: five looks are a seed
+_EXTENSIONS = 3  # of a pair of clusters: five detections are a seed
 _MAX_PAIRS = 1 << 20  # at once
 _MIN_DENSITY = 0.4  # of the scans of a lasting track that detect it
 _WIDE = 1.2  # m: clusters of nobody who walks alone
@@ -30,7 +30,7 @@ _CLAIM = 0.3  # m around a fast mover, within which points are its own
 _MIN_SHARE = 0.7  # of a track of walkers within a fast mover, from which on it is part of it
 
 
-class _Looks(NamedTuple):
+class _Clusters(NamedTuple):
     """C clusters that no lasting track explains, in the order of time.
 
     Attributes:
@@ -51,13 +51,13 @@ class _Looks(NamedTuple):
 
 
 class _Seeds(NamedTuple):
-    """H hypotheses: looks (H, n), their times, the edges (H, n, 2) that one velocity explains.
+    """H hypotheses: detections (H, n), their times, the edges (H, n, 2) that one velocity explains.
 
     `side` is the direction (H,) in which the edge lies, `cost` the sum of squared residuals in
     units of the gates.
     """
 
-    look: Index
+    member: Index
     xy: Float
     side: Index
     cost: Float
@@ -73,10 +73,10 @@ def find_fast_movers(points: DynamicPoints, owner: Index) -> tuple[Index, list[M
         owner: (N,) track numbers from `assign_tracks`.
     """
     lasting = _find_lasting(points, owner)
-    looks = _select_looks(points, owner, lasting)
-    if not len(looks.cluster):
+    clusters = _select_clusters(points, owner, lasting)
+    if not len(clusters.cluster):
         return owner, []
-    paths = _follow_seeds(points, looks, _find_seeds(looks))
+    paths = _follow_seeds(points, clusters, _find_seeds(clusters))
     owner, first = arrays.copy(owner, points.scratch), len(lasting)
     for number, path in enumerate(paths, start=first):
         owner[_claim(points, owner, path, lasting, first)] = number
@@ -107,7 +107,7 @@ def _find_lasting(points: DynamicPoints, owner: Index) -> Bool:
     return np.asarray(lasts & (scans >= _MIN_DENSITY * (last - first + 1)))
 
 
-def _select_looks(points: DynamicPoints, owner: Index, lasting: Bool) -> _Looks:
+def _select_clusters(points: DynamicPoints, owner: Index, lasting: Bool) -> _Clusters:
     """The clusters whose first point is of no lasting track, and wide ones."""
     begins = _cluster_begins(points)
     ends = np.append(begins[1:], len(points.cluster))
@@ -123,7 +123,7 @@ def _select_looks(points: DynamicPoints, owner: Index, lasting: Bool) -> _Looks:
         edge[:, k] = xy[order[first + size - 1]]
     scan = points.scan[begins]
     nearest = np.minimum.reduceat(points.range[own], first) if len(begins) else np.zeros(0)
-    return _Looks(
+    return _Clusters(
         points.cluster[begins], scan, points.seconds[scan], nearest, points.sensor[scan], edge
     )
 
@@ -143,22 +143,22 @@ def _unit_vectors() -> Float:
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def _find_seeds(looks: _Looks) -> _Seeds:
-    """Hypotheses of five looks, the best ones first."""
+def _find_seeds(clusters: _Clusters) -> _Seeds:
+    """Hypotheses of five detections, the best ones first."""
     parts = []
-    for block in _blocks_of_pairs(looks, np.arange(len(looks.scan))):
-        seeds = _pair(looks, block)
+    for block in _blocks_of_pairs(clusters, np.arange(len(clusters.scan))):
+        seeds = _pair(clusters, block)
         for _ in range(_EXTENSIONS):
-            blocks = _blocks_of_pairs(looks, seeds.look[:, -1])
-            seeds = _join([_extend(looks, _select(seeds, some)) for some in blocks])
+            blocks = _blocks_of_pairs(clusters, seeds.member[:, -1])
+            seeds = _join([_extend(clusters, _select(seeds, some)) for some in blocks])
         parts.append(seeds)
-    found = _join(parts)
-    return _select(found, np.argsort(found.cost, kind="stable"))
+    seeds = _join(parts)
+    return _select(seeds, np.argsort(seeds.cost, kind="stable"))
 
 
-def _blocks_of_pairs(looks: _Looks, of: Index) -> list[Index]:
-    """Rows of `of` (n,) in order, so many at once that they and their later looks are few."""
-    low, high = _later_range(looks, of)
+def _blocks_of_pairs(clusters: _Clusters, of: Index) -> list[Index]:
+    """Rows of `of` (n,) in order, so many at once that they and their later detections are few."""
+    low, high = _later_range(clusters, of)
     ends = np.flatnonzero(np.diff(np.cumsum(high - low) // _MAX_PAIRS)) + 1
     return np.split(np.arange(len(of)), ends)
 
@@ -171,55 +171,55 @@ def _join(parts: list[_Seeds]) -> _Seeds:
     return _Seeds._make(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def _later_range(looks: _Looks, of: Index) -> tuple[Index, Index]:
-    """First look of the next scans, and the one after the last of them, of looks (n,)."""
-    low = np.searchsorted(looks.scan, looks.scan[of], side="right")
-    high = np.searchsorted(looks.scan, looks.scan[of] + _MAX_SCANS, side="right")
-    until = np.searchsorted(looks.seconds, looks.seconds[of] + _MAX_STEP, side="right")
+def _later_range(clusters: _Clusters, of: Index) -> tuple[Index, Index]:
+    """First cluster of the next scans, and the one after the last of them, of clusters (n,)."""
+    low = np.searchsorted(clusters.scan, clusters.scan[of], side="right")
+    high = np.searchsorted(clusters.scan, clusters.scan[of] + _MAX_SCANS, side="right")
+    until = np.searchsorted(clusters.seconds, clusters.seconds[of] + _MAX_STEP, side="right")
     return low, np.maximum(np.minimum(high, until), low)
 
 
-def _pairs_of(looks: _Looks, of: Index) -> tuple[Index, Index]:
-    """Which of `of` (n,), and each of its later looks."""
-    low, high = _later_range(looks, of)
+def _pairs_of(clusters: _Clusters, of: Index) -> tuple[Index, Index]:
+    """Which of `of` (n,), and each of its later detections."""
+    low, high = _later_range(clusters, of)
     count = high - low
     which = np.repeat(np.arange(len(of)), count)
     return which, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
 
 
-def _pair(looks: _Looks, of: Index) -> _Seeds:
-    """Pairs of looks that something fast explains, by the edges that face the sensor."""
-    which, later = _pairs_of(looks, of)
-    one = of[which]
-    dt = (looks.seconds[later] - looks.seconds[one])[:, None]
-    middle = looks.edge.mean(axis=1)
-    step = middle[later] - middle[one]
+def _pair(clusters: _Clusters, of: Index) -> _Seeds:
+    """Pairs of detections that something fast explains, by the edges that face the sensor."""
+    which, later = _pairs_of(clusters, of)
+    first = of[which]
+    dt = (clusters.seconds[later] - clusters.seconds[first])[:, None]
+    middle = clusters.edge.mean(axis=1)
+    step = middle[later] - middle[first]
     near = np.linalg.norm(step, axis=1) < 1.5 * MAX_SPEED * dt[:, 0] + 1.0
-    one, later, step, dt = one[near], later[near], step[near], dt[near]
-    facing = ((looks.sensor[one] - middle[one]) * step).sum(axis=1) > 0.0
+    first, later, step, dt = first[near], later[near], step[near], dt[near]
+    facing = ((clusters.sensor[first] - middle[first]) * step).sum(axis=1) > 0.0
     turn = np.arctan2(step[:, 1], step[:, 0]) + np.where(facing, 0.0, np.pi)
     side = np.round(turn * _DIRECTIONS / (2.0 * np.pi)).astype(np.intp) % _DIRECTIONS
-    xy = np.stack([looks.edge[one, side], looks.edge[later, side]], axis=1)
+    xy = np.stack([clusters.edge[first, side], clusters.edge[later, side]], axis=1)
     speed = np.linalg.norm(xy[:, 1] - xy[:, 0], axis=1) / np.maximum(dt[:, 0], 1e-6)
     fast = (speed >= MIN_SPEED) & (speed <= MAX_SPEED)
-    seeds = _Seeds(np.column_stack([one, later]), xy, side, np.zeros(len(one)))
+    seeds = _Seeds(np.column_stack([first, later]), xy, side, np.zeros(len(first)))
     return _select(seeds, fast)
 
 
-def _extend(looks: _Looks, seeds: _Seeds) -> _Seeds:
-    """Hypotheses with one more look, the nearest to where their velocity leads."""
-    which, later = _pairs_of(looks, seeds.look[:, -1])
-    t = looks.seconds[seeds.look]
+def _extend(clusters: _Clusters, seeds: _Seeds) -> _Seeds:
+    """Hypotheses with one more cluster, the nearest to where their velocity leads."""
+    which, later = _pairs_of(clusters, seeds.member[:, -1])
+    t = clusters.seconds[seeds.member]
     span = np.maximum(t[:, -1] - t[:, 0], 1e-6)[:, None]
     velocity = (seeds.xy[:, -1] - seeds.xy[:, 0]) / span
     speed = np.linalg.norm(velocity, axis=1)
     u = velocity / np.maximum(speed, 1e-9)[:, None]
-    dt = looks.seconds[later] - t[which, -1]
-    xy = looks.edge[later, seeds.side[which]]
+    dt = clusters.seconds[later] - t[which, -1]
+    xy = clusters.edge[later, seeds.side[which]]
     off = xy - seeds.xy[which, -1] - dt[:, None] * velocity[which]
     along = (off * u[which]).sum(axis=1) / _GATE_ALONG
     across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / (
-        _GATE_ACROSS + _ACROSS_PER_METRE * looks.range[later]
+        _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
     )
     cost = along**2 + across**2
     near = np.flatnonzero(cost < 1.0)
@@ -227,35 +227,35 @@ def _extend(looks: _Looks, seeds: _Seeds) -> _Seeds:
     best = order[np.flatnonzero(np.diff(which[order], prepend=-1))]
     of = which[best]
     return _Seeds(
-        np.column_stack([seeds.look[of], later[best]]),
+        np.column_stack([seeds.member[of], later[best]]),
         np.concatenate([seeds.xy[of], xy[best][:, None]], axis=1),
         seeds.side[of],
         seeds.cost[of] + cost[best],
     )
 
 
-def _follow_seeds(points: DynamicPoints, looks: _Looks, seeds: _Seeds) -> list[MoverPath]:
-    """Paths that begin with a seed, those with most looks first; no other has most of its points.
+def _follow_seeds(points: DynamicPoints, clusters: _Clusters, seeds: _Seeds) -> list[MoverPath]:
+    """Paths that begin with a seed, the longest first; no other has most of its points.
 
     A seed may mistake what comes into view for motion, but cannot be followed for long.
     """
     used = np.zeros(int(points.cluster[-1]) + 1, bool)
-    found = list[tuple[MoverPath, Index]]()
+    followed = list[tuple[MoverPath, Index]]()
     for k in range(len(seeds.cost)):
-        cluster = looks.cluster[seeds.look[k]]
+        cluster = clusters.cluster[seeds.member[k]]
         if used[cluster].any():
             continue
         used[cluster] = True
-        t = looks.seconds[seeds.look[k]]
-        track = follow(points, looks.scan[seeds.look[k]], t, seeds.xy[k])
+        t = clusters.seconds[seeds.member[k]]
+        track = follow(points, clusters.scan[seeds.member[k]], t, seeds.xy[k])
         if track is not None:
             path = fit_path(track, points.seconds)
             mine = path.find_points(points, _CLAIM)
-            found.append((path, mine))
+            followed.append((path, mine))
             used[points.cluster[mine]] = True
-    found.sort(key=lambda one: -len(one[0].seconds))
+    followed.sort(key=lambda track: -len(track[0].seconds))
     taken, out = np.zeros(len(points.scan), bool), []
-    for path, mine in found:
+    for path, mine in followed:
         if 2 * np.count_nonzero(taken[mine]) <= len(mine):
             out.append(path)
             taken[mine] = True

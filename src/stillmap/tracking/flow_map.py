@@ -54,7 +54,7 @@ def compute_flow_map(objects: Sequence[MovingTrack], resolution: float = 0.5) ->
         objects: moving objects.
         resolution: metres, edge of a square.
     """
-    crossings = [_crossings(one, resolution) for one in objects]
+    crossings = [_crossings(mover, resolution) for mover in objects]
     cells = np.concatenate([np.zeros((0, 2), np.int64), *(cell for cell, _ in crossings)])
     speeds = np.concatenate([np.zeros(0), *(speed for _, speed in crossings)])
     if len(cells) == 0:
@@ -78,11 +78,11 @@ def compute_flow_map(objects: Sequence[MovingTrack], resolution: float = 0.5) ->
     )
 
 
-def _crossings(one: MovingTrack, resolution: float) -> tuple[Int64, Float]:
+def _crossings(mover: MovingTrack, resolution: float) -> tuple[Int64, Float]:
     """Squares (V, 2) that an object crosses, column and row, and its mean speed (V,) there."""
-    seconds = 1e-9 * (one.stamp_ns - one.stamp_ns[0])
-    xy, t = _resample(one.xy, seconds, _STEP * resolution)
-    speed = np.interp(t, seconds, np.linalg.norm(one.velocity, axis=1))
+    seconds = 1e-9 * (mover.stamp_ns - mover.stamp_ns[0])
+    xy, t = _resample(mover.xy, seconds, _STEP * resolution)
+    speed = np.interp(t, seconds, np.linalg.norm(mover.velocity, axis=1))
     cell = np.floor(xy / resolution).astype(np.int64)
     # in the order of squares, then time: a crossing begins with a new square, or after a while
     order = np.lexsort((t, cell[:, 0], cell[:, 1]))

@@ -36,7 +36,7 @@ _ROUNDS = 50  # of belief propagation
 _MAX_EXPONENT = 50.0
 
 
-class Looks(NamedTuple):
+class Detections(NamedTuple):
     """L detections of pieces.
 
     Attributes:
@@ -67,11 +67,11 @@ class _Ends(NamedTuple):
     speed_std: Float
 
 
-def join_pieces(looks: Looks, is_fast: Bool, period: float) -> tuple[Index, Float]:
+def join_pieces(detections: Detections, is_fast: Bool, period: float) -> tuple[Index, Float]:
     """Join the pieces of each mover.
 
     Args:
-        looks: the detections.
+        detections: the detections.
         is_fast: (K,) pieces of vehicles.
         period: s from scan to scan.
 
@@ -84,7 +84,7 @@ def join_pieces(looks: Looks, is_fast: Bool, period: float) -> tuple[Index, Floa
         return label, log_p
     for min_p in _MIN_P:
         node, of_label = np.unique(label, return_inverse=True)
-        ends = _describe_ends(looks, of_label[looks.piece], is_fast[node], period)
+        ends = _describe_ends(detections, of_label[detections.piece], is_fast[node], period)
         before, after, log_ratio = _find_candidates(ends)
         p = compute_marginals(before, after, log_ratio, len(node))
         root = np.arange(len(node))
@@ -130,10 +130,10 @@ def _choose(
     return following, cost
 
 
-def _describe_ends(looks: Looks, node: Index, is_fast: Bool, period: float) -> _Ends:
+def _describe_ends(detections: Detections, node: Index, is_fast: Bool, period: float) -> _Ends:
     """Ends of nodes, of which each detection (L,) has one."""
-    order = np.lexsort((looks.seconds, node))
-    node, t, xy = node[order], looks.seconds[order], looks.xy[order]
+    order = np.lexsort((detections.seconds, node))
+    node, t, xy = node[order], detections.seconds[order], detections.xy[order]
     first = np.flatnonzero(np.diff(node, prepend=-1))
     count = np.diff(first, append=len(node))
     last = first + count - 1
@@ -142,8 +142,8 @@ def _describe_ends(looks: Looks, node: Index, is_fast: Bool, period: float) -> _
     since, until = t - t[first][node], t[last][node] - t
     early = np.bincount(node[since <= _HORIZON], minlength=len(first))
     late = np.bincount(node[until <= _HORIZON], minlength=len(first))
-    width = np.bincount(node, looks.width[order]) / count
-    spread = np.bincount(node, (looks.width[order] - width[node]) ** 2) / count
+    width = np.bincount(node, detections.width[order]) / count
+    spread = np.bincount(node, (detections.width[order] - width[node]) ** 2) / count
     return _Ends(
         t[first],
         t[last],
@@ -210,14 +210,14 @@ def _compare(ends: _Ends, before: Index, after: Index) -> Float:
     )
     duration = np.log(_SEEN_AGAIN / _HIDDEN) - gap / _HIDDEN
     variance = ends.speed_std[after] ** 2 + end.P[:, 2]
-    other = np.log(_BIRTHS / (2.0 * np.pi * variance)) - 0.5 * (end.v**2).sum(axis=1) / variance
-    return np.asarray(motion + duration + _compare_widths(ends, before, after) - other)
+    unrelated = np.log(_BIRTHS / (2.0 * np.pi * variance)) - 0.5 * (end.v**2).sum(axis=1) / variance
+    return np.asarray(motion + duration + _compare_widths(ends, before, after) - unrelated)
 
 
-def _log_density(predicted: TrackStates, found: TrackStates) -> Float:
+def _log_density(predicted: TrackStates, detected: TrackStates) -> Float:
     """(P,) ln of the density of the difference of two states, of position and velocity."""
-    xx, xv, vv = (predicted.P + found.P).T
-    dx, dv = found.x - predicted.x, found.v - predicted.v
+    xx, xv, vv = (predicted.P + detected.P).T
+    dx, dv = detected.x - predicted.x, detected.v - predicted.v
     determinant = xx * vv - xv**2
     squares = vv * (dx**2).sum(axis=1) - 2.0 * xv * (dx * dv).sum(axis=1)
     squares += xx * (dv**2).sum(axis=1)
@@ -228,6 +228,6 @@ def _compare_widths(ends: _Ends, before: Index, after: Index) -> Float:
     """(P,) log likelihood ratio of the later width, given the earlier one or nothing."""
     mean, spread = float(ends.width.mean()), float(ends.width.var())
     own = ends.width_variance[after] + _WIDTH_STD**2
-    same, other = own + ends.width_variance[before], own + spread
+    same, unrelated = own + ends.width_variance[before], own + spread
     off, apart = ends.width[after] - mean, ends.width[after] - ends.width[before]
-    return np.asarray(0.5 * (off**2 / other - apart**2 / same + np.log(other / same)))
+    return np.asarray(0.5 * (off**2 / unrelated - apart**2 / same + np.log(unrelated / same)))

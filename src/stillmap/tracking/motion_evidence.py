@@ -1,6 +1,6 @@
 """Motion evidence: the probability that what a track follows is a mover, not clutter.
 
-Furniture that some looks hit and others pass (legs of chairs, edges, thin stands, under a scan
+Furniture that some views hit and others pass (legs of chairs, edges, thin stands, under a scan
 plane that tilts) resembles a mover in each of its cells. Over a track it does not: it goes nowhere,
 beams pass its place between two detections, it appears and vanishes in plain view. The share of
 movers among the tracks is learned from each recording by EM: where many people walk, one that
@@ -39,10 +39,10 @@ from stillmap.tracking.tracklets import join_tracklets
 Places = tuple[Index, Float]  # scans (n,) and positions (n, 2) of one track
 
 _MIN_P_DYNAMIC = 0.5  # of the beams that are judged
-_LOOK_TIME = 0.1  # s: looks nearer in time say the same
+_VIEW_TIME = 0.1  # s: views nearer in time say the same
 _MAX_JUMP = 1.0  # m between two detections at one place
-_EDGE_TIME, _EDGE_LOOKS = 1.0, 8  # s before the first and after the last detection; looks there
-_OPEN_SHARE = 0.28  # of these looks that pass: the end lies in plain view
+_EDGE_TIME, _EDGE_VIEWS = 1.0, 8  # s before the first and after the last detection; views there
+_OPEN_SHARE = 0.28  # of these views that pass: the end lies in plain view
 _REST_TIME = 0.3  # s, see regress_velocity
 _FAST_TRAVEL = 3.0  # m along the path of a fast mover that count as a window of steady motion
 _MAX_LINE_SPREAD = 1.25  # times the noise, across a straight surface
@@ -55,9 +55,9 @@ _MAX_BEARING = 0.06  # rad to the nearest beam: farther off is out of view
 
 # Beta(1, 15): share of the windows in which clutter seems to move; also of half of the movers
 _STILL_WINDOWS = 15.0
-_SEEN_LOOKS = 19.0  # Beta(19, 1): share of the looks that detect a mover in view
-_THIN_HITS, _THIN = 3.0, (5.0, 3.0)  # hits per look below which half of the movers are thin: Beta
-_CLUTTER = (1.0, 1.0)  # Beta: share of the looks that detect clutter
+_SEEN_SHARE = 19.0  # Beta(19, 1): share of the views that detect a mover in view
+_THIN_HITS, _THIN = 3.0, (5.0, 3.0)  # hits per view below which half of the movers are thin: Beta
+_CLUTTER = (1.0, 1.0)  # Beta: share of the views that detect clutter
 _OPEN = 0.5  # nats against a mover, for each end in plain view
 
 
@@ -65,9 +65,9 @@ class TrackEvidence(NamedTuple):
     """Features of K tracks for the likelihood ratio of mover to clutter, each (K,).
 
     Attributes:
-        looks: detections, at most one per 0.1 s.
+        detections: detections, at most one per 0.1 s.
         hits: end points per detection.
-        missed: looks between detections in which beams passed.
+        missed: views between detections in which beams passed.
         windows, moving: windows of 1.5 s, one after the other, and those of steady motion.
         open_ends: 0 to 2, how many of its ends lie in plain view.
         slides: 1 if its end points lie on a line that is longer than a person is wide, along which
@@ -75,7 +75,7 @@ class TrackEvidence(NamedTuple):
             the robot drives by; else 0.
     """
 
-    looks: Float
+    detections: Float
     hits: Float
     missed: Float
     windows: Float
@@ -151,7 +151,7 @@ def weigh_tracks(
         evidence.moving[k] = max(evidence.moving[k], moving)
         evidence.slides[k] = 0.0  # the side of a car is as straight
     out = np.zeros(int(tracks.max()) + 1)
-    out[tracks] = fit_share(compute_log_ratio(evidence), evidence.looks)
+    out[tracks] = fit_share(compute_log_ratio(evidence), evidence.detections)
     return out, tracks[evidence.slides > 0.0].tolist()
 
 
@@ -162,8 +162,8 @@ def compute_log_ratio(e: TrackEvidence) -> Float:
     motion = np.logaddexp(_log_mean_power(e.moving, rest, 1.0, 1.0), still) - np.log(2.0) - still
     motion = np.where(e.slides > 0.0, np.log(_P_WALKS_ON_LINE), motion)
     # the first detection began the track: it says nothing
-    seen = np.maximum(e.looks - 1.0, 0.0)
-    thick = _log_mean_power(seen, e.missed, _SEEN_LOOKS, 1.0)
+    seen = np.maximum(e.detections - 1.0, 0.0)
+    thick = _log_mean_power(seen, e.missed, _SEEN_SHARE, 1.0)
     thin = np.logaddexp(thick, _log_mean_power(seen, e.missed, *_THIN)) - np.log(2.0)
     detection = np.where(e.hits < _THIN_HITS, thin, thick)
     detection -= _log_mean_power(seen, e.missed, *_CLUTTER)
@@ -185,29 +185,29 @@ def collect_evidence(
         T_map_sensor: (T, 3, 3) sensor poses.
         points, owner, noise_std: see `weigh_tracks`.
     """
-    period = float(np.median(np.diff(points.seconds))) if len(points.seconds) > 1 else _LOOK_TIME
-    stride = max(1, round(_LOOK_TIME / max(period, 1e-3)))
+    period = float(np.median(np.diff(points.seconds))) if len(points.seconds) > 1 else _VIEW_TIME
+    stride = max(1, round(_VIEW_TIME / max(period, 1e-3)))
     parts, tracks = [], list[int]()
     pairs = iterate_tracks(points, owner)
     while batch := list(itertools.islice(pairs, _BATCH)):
         tracks += [track for track, _ in batch]
         rows, gaps, ends = [], list[Places](), list[Places]()
         for _, here in batch:
-            found = compute_centroids(points, owner, here)
-            looks, t = len(found.scan), points.seconds[found.scan]
-            steady = count_steady_windows(t, found.xy, period)
+            centroids = compute_centroids(points, owner, here)
+            detections, t = len(centroids.scan), points.seconds[centroids.scan]
+            steady = count_steady_windows(t, centroids.xy, period)
             most = _MAX_SLIDE_SPEED * float(t[-1] - t[0])
             slides = lies_on_line(points.xy[here], noise_std, _MIN_LINE, most)
-            rows.append((max(1.0, looks / stride), len(here) / looks, *steady, slides))
-            gaps.append(_interpolate_gaps(points.seconds, found.scan, found.xy, stride))
-            ends += _extrapolate_ends(points.seconds, found.scan, found.xy)
+            rows.append((max(1.0, detections / stride), len(here) / detections, *steady, slides))
+            gaps.append(_interpolate_gaps(points.seconds, centroids.scan, centroids.xy, stride))
+            ends += _extrapolate_ends(points.seconds, centroids.scan, centroids.xy)
         missed = _count_passes(recording, T_map_sensor, gaps)
         sampled = np.array([len(scan) for scan, _ in ends])
         passed = _count_passes(recording, T_map_sensor, ends)
         is_open = (sampled > 1) & (passed >= _OPEN_SHARE * sampled)
         parts.append(np.column_stack([np.array(rows), missed, is_open.reshape(-1, 2).sum(axis=1)]))
-    looks_, hits, windows, moving, slides, missed, open_ends = np.concatenate(parts).T
-    evidence = TrackEvidence(looks_, hits, missed, windows, moving, open_ends, slides)
+    detections_, hits, windows, moving, slides, missed, open_ends = np.concatenate(parts).T
+    evidence = TrackEvidence(detections_, hits, missed, windows, moving, open_ends, slides)
     return np.array(tracks), evidence
 
 
@@ -221,7 +221,7 @@ def lies_on_line(xy: Float, noise_std: float, least: float, most: float) -> bool
 
 
 def _count_passes(recording: Recording, T_map_sensor: Float, places: list[Places]) -> Float:
-    """(L,) looks that passed, of L lists of places."""
+    """(L,) views that passed, of L lists of places."""
     of = np.repeat(np.arange(len(places)), [len(scan) for scan, _ in places])
     scan, xy = (np.concatenate(column) for column in zip(*places, strict=True))
     visibility = _classify_visibility(recording, T_map_sensor, scan, xy)
@@ -249,7 +249,7 @@ def _extrapolate_ends(seconds: Float, scan: Index, xy: Float) -> Iterator[Places
         (0, t <= t[0] + _EDGE_TIME, np.arange(first, scan[0])),
         (-1, t >= t[-1] - _EDGE_TIME, np.arange(scan[-1] + 1, last)),
     ):
-        some = scans[:: max(1, -(-len(scans) // _EDGE_LOOKS))]
+        some = scans[:: max(1, -(-len(scans) // _EDGE_VIEWS))]
         velocity = regress_velocity(t[end], xy[end], _REST_TIME)
         yield some, xy[at] + (seconds[some] - t[at])[:, None] * velocity
 

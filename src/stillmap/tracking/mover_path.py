@@ -1,7 +1,7 @@
 """Paths of movers: a box at any time; of vehicles, which a Kalman filter follows by their edge.
 
 The filter follows the edge of a fast object that faces the sensor, front or rear; a smoothing
-spline through these looks is the path of its center.
+spline through these detections is the path of its center.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,16 @@ _GATE, _MAX_GATE, _GATE_SIGMAS = 0.3, 1.2, 2.0  # m, m, standard deviations of t
 _LENGTH, _HALF_WIDTH = 6.5, 1.3  # m, of a large van
 _EDGE_DEPTH = 0.4  # m of the object that count as its edge
 _MAX_GAP = 1.2  # s without a point
-_MIN_LOOKS, _MIN_TRAVEL, _MIN_FOUND = 5, 3.0, 0.6  # looks, m, share of the looks: a track
-_EXTENT_LOOKS = 3  # that see as much of it as its length and width
+_MIN_DETECTIONS, _MIN_TRAVEL, _MIN_FOUND = (
+    5,
+    3.0,
+    0.6,
+)  # detections, m, share of the detections: a track
+_EXTENT_DETECTIONS = 3  # that see as much of it as its length and width
 
 
-class EdgeLooks(NamedTuple):
-    """Looks at the edge of an object, rising in time.
+class EdgeDetections(NamedTuple):
+    """Detections at the edge of an object, rising in time.
 
     Attributes:
         scan: (L,) their scans.
@@ -52,12 +56,12 @@ class _Run(NamedTuple):
     extents: list[tuple[float, float]]
 
 
-def follow(points: DynamicPoints, scan: Index, seconds: Float, xy: Float) -> EdgeLooks | None:
+def follow(points: DynamicPoints, scan: Index, seconds: Float, xy: Float) -> EdgeDetections | None:
     """Follow an object forwards and backwards from its seed; None if that is no object.
 
     Args:
         points: dynamic end points.
-        scan, seconds: (n,) of the looks of the seed.
+        scan, seconds: (n,) of the detections of the seed.
         xy: (n, 2) its edge that faces the sensor.
     """
     velocity = (xy[-1] - xy[0]) / (seconds[-1] - seconds[0])
@@ -65,14 +69,14 @@ def follow(points: DynamicPoints, scan: Index, seconds: Float, xy: Float) -> Edg
     ahead = _run(points, int(scan[0]), xy[0], velocity, 1)
     rows = np.array([*back.edges[:0:-1], *ahead.edges])
     scans = {*back.scans, *ahead.scans}
-    if len(rows) < _MIN_LOOKS or len(scans) < _MIN_FOUND * (max(scans) - min(scans) + 1):
+    if len(rows) < _MIN_DETECTIONS or len(scans) < _MIN_FOUND * (max(scans) - min(scans) + 1):
         return None
     if np.linalg.norm(rows[-1, 1:3] - rows[0, 1:3]) < _MIN_TRAVEL:
         return None
     extents = np.sort([*back.extents, *ahead.extents], axis=0)
-    length, width = extents[-_EXTENT_LOOKS].tolist()
-    looks = rows[:, 0].astype(np.intp)
-    return EdgeLooks(looks, rows[:, 1:3], rows[:, 3:5], rows[:, 5] > 0.0, length, width)
+    length, width = extents[-_EXTENT_DETECTIONS].tolist()
+    scan_of_edge = rows[:, 0].astype(np.intp)
+    return EdgeDetections(scan_of_edge, rows[:, 1:3], rows[:, 3:5], rows[:, 5] > 0.0, length, width)
 
 
 def _run(points: DynamicPoints, scan: int, edge: Float, velocity: Float, step: int) -> _Run:
@@ -214,7 +218,7 @@ def _solve_banded(banded: Float, right: Float) -> Float:
 
 _PATH_STD, _PATH_ACCELERATION = 0.15, 2.0  # m, m2/s3: of the smoothed path
 _MIN_LENGTH, _MIN_WIDTH = 1.0, 0.8  # m, of what is seen as one beam
-_REACH = 0.5  # s before the first look and after the last
+_REACH = 0.5  # s before the first detection and after the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +226,7 @@ class MoverPath:
     """A box that moves.
 
     Attributes:
-        seconds: (L,) times of the looks, rising.
+        seconds: (L,) times of the detections, rising.
         xy: (L, 2) metres, its center in the map frame.
         velocity: (L, 2) metres per second.
         length, width: metres, of the box.
@@ -238,11 +242,11 @@ class MoverPath:
 
     @property
     def travel(self) -> float:
-        """Metres from the first look to the last."""
+        """Metres from the first detection to the last."""
         return float(np.linalg.norm(self.xy[-1] - self.xy[0]))
 
     def state_at(self, seconds: Float) -> tuple[Float, Float]:
-        """(n, 2) center and velocity at times (n,); constant velocity beyond the looks."""
+        """(n, 2) center and velocity at times (n,); constant velocity beyond the detections."""
         inside = np.clip(seconds, self.seconds[0], self.seconds[-1])
         x, v = (
             np.stack([np.interp(inside, self.seconds, c) for c in column.T], axis=-1)
@@ -274,15 +278,15 @@ class MoverPath:
         return np.asarray(low + np.flatnonzero(self.contains(t, points.xy[low:high], margin)))
 
 
-def fit_path(looks: EdgeLooks, seconds: Float) -> MoverPath:
+def fit_path(edges: EdgeDetections, seconds: Float) -> MoverPath:
     """The path of the center.
 
     Args:
-        looks: at one or the other end of it.
+        edges: at one or the other end of it.
         seconds: (T,) times of the scans.
     """
-    length, width = max(looks.length, _MIN_LENGTH), max(looks.width, _MIN_WIDTH)
-    back = np.where(looks.leads, -0.5, 0.5)[:, None] * length
-    t = seconds[looks.scan]
-    xy, velocity = smooth_track(t, looks.xy + back * looks.heading, _PATH_STD, _PATH_ACCELERATION)
+    length, width = max(edges.length, _MIN_LENGTH), max(edges.width, _MIN_WIDTH)
+    back = np.where(edges.leads, -0.5, 0.5)[:, None] * length
+    t = seconds[edges.scan]
+    xy, velocity = smooth_track(t, edges.xy + back * edges.heading, _PATH_STD, _PATH_ACCELERATION)
     return MoverPath(t, xy, velocity, length, width)

@@ -115,15 +115,15 @@ def track_objects(
     kept = _ObjectStore(recording.scratch)
     fast = tracks_of_paths(points, owner, paths)
     for track, here in iterate_tracks(points, owner):
-        found = compute_centroids(points, owner, here)
+        centroids = compute_centroids(points, owner, here)
         mine = [path for path, number in zip(paths, fast, strict=True) if number == track]
-        one = _make_object(points, here, found.scan, found.xy, mine, recording, p_static)
-        if float(np.linalg.norm(np.ptp(one.xy, axis=0))) + max(one.size) >= options.min_extent:
-            kept.add(dataclasses.replace(one, p_identity=float(p_identity[track])))
+        mover = _make_object(points, here, centroids.scan, centroids.xy, mine, recording, p_static)
+        if float(np.linalg.norm(np.ptp(mover.xy, axis=0))) + max(mover.size) >= options.min_extent:
+            kept.add(dataclasses.replace(mover, p_identity=float(p_identity[track])))
         arrays.release_pages(p_static)
     objects = kept.objects()
-    objects.sort(key=lambda one: (one.scan[0], one.beams[0]))
-    return [dataclasses.replace(one, id=number) for number, one in enumerate(objects)]
+    objects.sort(key=lambda mover: (mover.scan[0], mover.beams[0]))
+    return [dataclasses.replace(mover, id=number) for number, mover in enumerate(objects)]
 
 
 class _ObjectStore:
@@ -139,11 +139,13 @@ class _ObjectStore:
         }
         self._rows: list[tuple[int, int, tuple[float, ...], float, float]] = []
 
-    def add(self, one: MovingObject) -> None:
-        self._rows.append((len(one.scan), len(one.beams), one.size, one.p_dynamic, one.p_identity))
-        self._beams.append(one.beams)
+    def add(self, mover: MovingObject) -> None:
+        self._rows.append(
+            (len(mover.scan), len(mover.beams), mover.size, mover.p_dynamic, mover.p_identity)
+        )
+        self._beams.append(mover.beams)
         for name, column in self._columns.items():
-            column.append(getattr(one, name))
+            column.append(getattr(mover, name))
 
     def objects(self) -> list[MovingObject]:
         """All objects, their ids 0; nothing can be added afterwards."""

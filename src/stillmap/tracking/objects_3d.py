@@ -62,8 +62,8 @@ def track_objects_3d(
     objects = track_objects(planar, planar_poses, p_static[nearest], options)
     owned = _collect_beams(objects, nearest, segment, beam)
     found_3d = [
-        _add_height(one, beams, recording, poses, p_static)
-        for one, beams in zip(objects, owned, strict=True)
+        _add_height(mover, beams, recording, poses, p_static)
+        for mover, beams in zip(objects, owned, strict=True)
     ]
     return select_movers(drop_surface_parts(found_3d, recording, p_static), recording, poses)
 
@@ -140,11 +140,11 @@ def _collect_beams(
         beam: their numbers, rising.
     """
     if not len(beam):
-        return [nearest[one.beams] for one in objects]
+        return [nearest[mover.beams] for mover in objects]
     segment_of = segment[np.searchsorted(beam, nearest)]
     owner = np.full(len(nearest), len(objects), np.int64)
-    for k, one in enumerate(objects):
-        owner[one.beams] = k
+    for k, mover in enumerate(objects):
+        owner[mover.beams] = k
     pairs, counts = np.unique(np.stack([segment_of, owner], axis=1), axis=0, return_counts=True)
     order = np.lexsort((-counts, pairs[:, 0]))
     first = np.diff(pairs[order, 0], prepend=-1) > 0
@@ -154,18 +154,18 @@ def _collect_beams(
     rank = np.argsort(of_beam, kind="stable")
     ends = np.searchsorted(of_beam[rank], np.arange(len(objects) + 1))
     return [
-        np.union1d(beam[rank[a:b]], nearest[one.beams])
-        for one, a, b in zip(objects, ends[:-1], ends[1:], strict=True)
+        np.union1d(beam[rank[a:b]], nearest[mover.beams])
+        for mover, a, b in zip(objects, ends[:-1], ends[1:], strict=True)
     ]
 
 
 def _add_height(
-    one: MovingObject, beams: Index, recording: Recording, poses: Float, p_static: Float32
+    mover: MovingObject, beams: Index, recording: Recording, poses: Float, p_static: Float32
 ) -> MovingObject:
     """The object with all its beams, the height of its center in each scan, and of its box."""
     z = recording.end_points(beams, poses)[:, 2]
-    at = np.searchsorted(one.scan, recording.scans_of(beams)).clip(0, len(one.scan) - 1)
-    low, high = np.full(len(one.scan), np.inf), np.full(len(one.scan), -np.inf)
+    at = np.searchsorted(mover.scan, recording.scans_of(beams)).clip(0, len(mover.scan) - 1)
+    low, high = np.full(len(mover.scan), np.inf), np.full(len(mover.scan), -np.inf)
     np.minimum.at(low, at, z)
     np.maximum.at(high, at, z)
     center = 0.5 * (low + high)
@@ -173,9 +173,9 @@ def _add_height(
     center = np.interp(np.arange(len(center)), np.flatnonzero(known), center[known])
     bottom, top = np.percentile(z - center[at], [_OUTLIERS, 100.0 - _OUTLIERS])
     return dataclasses.replace(
-        one,
+        mover,
         beams=beams,
         z=center,
-        size=(*one.size[:2], float(top - bottom)),
+        size=(*mover.size[:2], float(top - bottom)),
         p_dynamic=float(1.0 - take_rows(p_static, beams).mean(dtype=np.float64)),
     )

@@ -21,7 +21,7 @@ from stillmap.tracking.detections import (
     scan_blocks,
 )
 from stillmap.tracking.fast_movers import tracks_of_paths
-from stillmap.tracking.joins import Looks, join_pieces
+from stillmap.tracking.joins import Detections, join_pieces
 from stillmap.tracking.mover_path import MoverPath
 
 NO_PIECE = -1
@@ -34,19 +34,19 @@ _REACH = 1.0  # s by which a path extends at constant velocity
 _REST_TIME = 0.3  # s, see regress_velocity
 
 
-def cut_tracks(found: Centroids, seconds: Float, whole: Index) -> Index:
+def cut_tracks(centroids: Centroids, seconds: Float, whole: Index) -> Index:
     """(L,) numbers of the pieces that centroids are of, rising; -1 in encounters.
 
     Args:
-        found: of all tracks.
+        centroids: of all tracks.
         seconds: (T,) times of the scans.
         whole: tracks that are not cut.
     """
-    t, may_be_cut = seconds[found.scan], ~np.isin(found.track, whole)
+    t, may_be_cut = seconds[centroids.scan], ~np.isin(centroids.track, whole)
     near = np.zeros(len(t), bool)
-    near[find_near_pairs(found.scan, found.xy, _NEAR).ravel()] = True
-    near = _select_short_runs(np.flatnonzero(near & may_be_cut), found.track, t)
-    begins = np.diff(found.track, prepend=-1) != 0
+    near[find_near_pairs(centroids.scan, centroids.xy, _NEAR).ravel()] = True
+    near = _select_short_runs(np.flatnonzero(near & may_be_cut), centroids.track, t)
+    begins = np.diff(centroids.track, prepend=-1) != 0
     begins |= np.diff(near, prepend=False)
     begins |= (np.diff(t, prepend=t[:1]) > _MAX_GAP) & may_be_cut
     pieces = np.cumsum(begins & ~near) - 1
@@ -66,18 +66,20 @@ def _select_short_runs(at: Index, track: Index, t: Float) -> Bool:
     return np.asarray(np.cumsum(steps[:-1]) > 0)
 
 
-def assign_to_paths(points: DynamicPoints, rest: Index, found: Centroids, mover: Index) -> Index:
+def assign_to_paths(
+    points: DynamicPoints, rest: Index, centroids: Centroids, mover: Index
+) -> Index:
     """(n,) the mover whose path is nearest to each of some points, -1: none.
 
     Args:
         points: dynamic end points.
         rest: (n,) indices of points, rising.
-        found: (L,) centroids outside of encounters.
+        centroids: (L,) centroids outside of encounters.
         mover: (L,) whose they are.
     """
     scan, out = points.scan[rest], np.full(len(rest), -1)
     best = np.full(len(rest), _CLAIM**2)
-    for number, t, xy in _iterate_paths(found, mover, points.seconds):
+    for number, t, xy in _iterate_paths(centroids, mover, points.seconds):
         reach = np.searchsorted(points.seconds, [t[0] - _REACH, t[-1] + _REACH])
         low, high = np.searchsorted(scan, reach).tolist()
         if low == high:
@@ -91,13 +93,13 @@ def assign_to_paths(points: DynamicPoints, rest: Index, found: Centroids, mover:
 
 
 def _iterate_paths(
-    found: Centroids, mover: Index, seconds: Float
+    centroids: Centroids, mover: Index, seconds: Float
 ) -> Iterator[tuple[int, Float, Float]]:
     """Yield each mover with its times and positions."""
-    order = np.lexsort((found.scan, mover))
+    order = np.lexsort((centroids.scan, mover))
     cuts = np.flatnonzero(np.diff(mover[order])) + 1
     for part in np.split(order, cuts) if len(order) else []:
-        yield int(mover[part[0]]), seconds[found.scan[part]], found.xy[part]
+        yield int(mover[part[0]]), seconds[centroids.scan[part]], centroids.xy[part]
 
 
 def _locate(seconds: Float, t: Float, xy: Float) -> Float:
@@ -141,20 +143,20 @@ def join_tracklets(
     """
     owner = _merge_pairs(points, owner)
     fast = np.array(tracks_of_paths(points, owner, list(paths)), np.intp)
-    found = collect_centroids(points, owner)
-    piece = cut_tracks(found, points.seconds, fast)
+    centroids = collect_centroids(points, owner)
+    piece = cut_tracks(centroids, points.seconds, fast)
     own = np.flatnonzero(piece >= 0)
-    outside, piece_of = Centroids._make(column[own] for column in found), piece[own]
+    outside, piece_of = Centroids._make(column[own] for column in centroids), piece[own]
     n = int(piece.max(initial=-1)) + 1
     is_fast = np.zeros(n, bool)
     is_fast[piece_of] = np.isin(outside.track, fast)
     width = measure_widths(points, outside)
-    looks = Looks(piece_of, points.seconds[outside.scan], outside.xy, width)
-    mover, p_identity = join_pieces(looks, is_fast, points.period)
+    detections = Detections(piece_of, points.seconds[outside.scan], outside.xy, width)
+    mover, p_identity = join_pieces(detections, is_fast, points.period)
     # who is near others all the time keeps his track
-    number = n + found.track
+    number = n + centroids.track
     number[own] = mover[piece_of]
-    out = _number_points(points, owner, found, number)
+    out = _number_points(points, owner, centroids, number)
     parts = [np.flatnonzero(out[block] >= n) + block.start for block in arrays.iter_blocks(out)]
     rest = np.concatenate([np.zeros(0, np.intp), *parts])
     nearest = assign_to_paths(points, rest, outside, mover[piece_of])
@@ -162,11 +164,13 @@ def join_tracklets(
     return out, np.append(p_identity, np.ones(count_tracks(owner)))
 
 
-def _number_points(points: DynamicPoints, owner: Index, found: Centroids, number: Index) -> Index:
+def _number_points(
+    points: DynamicPoints, owner: Index, centroids: Centroids, number: Index
+) -> Index:
     """(N,) the numbers (L,) of the centroids that points are part of."""
     out = arrays.empty(owner.shape, np.intp, points.scratch)
     scans = len(points.seconds)
-    key = found.track * scans + found.scan  # rising
+    key = centroids.track * scans + centroids.scan  # rising
     for block in arrays.iter_blocks(owner, out):
         out[block] = number[np.searchsorted(key, owner[block] * scans + points.scan[block])]
     return out
@@ -176,10 +180,12 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     """Merge tracks that always move together, nearer than people do: legs tracked apart."""
     parts, scans = list[tuple[Index, Index]](), np.zeros(count_tracks(owner), np.intp)
     for here in scan_blocks(points, owner):
-        found = compute_centroids(points, owner, here)
-        pairs = np.sort(found.track[find_near_pairs(found.scan, found.xy, _PAIR_DISTANCE)], axis=1)
+        centroids = compute_centroids(points, owner, here)
+        pairs = np.sort(
+            centroids.track[find_near_pairs(centroids.scan, centroids.xy, _PAIR_DISTANCE)], axis=1
+        )
         parts.append(np.unique(pairs, axis=0, return_counts=True))
-        scans += np.bincount(found.track, minlength=len(scans))
+        scans += np.bincount(centroids.track, minlength=len(scans))
     tracks, which = np.unique(
         np.concatenate([pairs for pairs, _ in parts]), axis=0, return_inverse=True
     )
@@ -201,10 +207,10 @@ def _confirm(points: DynamicPoints, owner: Index) -> Index:
         return owner
     scans, first, last = np.zeros(n, np.intp), np.full(n, np.inf), np.full(n, -np.inf)
     for here in scan_blocks(points, owner):
-        found = compute_centroids(points, owner, here)
-        scans += np.bincount(found.track, minlength=n)
-        np.minimum.at(first, found.track, points.seconds[found.scan])
-        np.maximum.at(last, found.track, points.seconds[found.scan])
+        centroids = compute_centroids(points, owner, here)
+        scans += np.bincount(centroids.track, minlength=n)
+        np.minimum.at(first, centroids.track, points.seconds[centroids.scan])
+        np.maximum.at(last, centroids.track, points.seconds[centroids.scan])
     duration = np.subtract(last, first, out=np.zeros(n), where=scans > 0)
     confirmed = (scans >= MIN_TRACK_SCANS) & (duration >= _MIN_DURATION)
     return renumber(points, owner, lambda old: np.where((old >= 0) & confirmed[old], old, -1))

@@ -120,10 +120,10 @@ class Transforms:
     def _look_up(self, target: str, source: str, stamp: int) -> Float | None:
         """(4, 4) T_target_source; None: it is not known at this time."""
         try:
-            found = self.buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp))
+            message = self.buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp))
         except TransformException:
             return None
-        T, t, q = np.eye(4), found.transform.translation, found.transform.rotation
+        T, t, q = np.eye(4), message.transform.translation, message.transform.rotation
         T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
         T[:3, 3] = t.x, t.y, t.z
         return T if (np.abs(T) < MAX_TRANSLATION).all() else None
