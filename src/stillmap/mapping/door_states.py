@@ -39,20 +39,30 @@ def observe_states(
         poses: (T, 3, 3) T_map_base.
         resolution: m, edge of a cell.
     """
-    masks = [_LeafMask(door) for door in doors]
-    seen: list[list[Int64]] = [[np.empty((0, 2), np.int64)] for _ in doors]
-    for block in iter_blocks(recording.hit) if doors else ():
+    leaves = [np.concatenate([door.shut_cells, door.open_cells]) for door in doors]
+    hits = _find_hits_on(leaves, recording, poses, resolution)
+    return [
+        _list_states(door, rows, recording.stamp_ns) for door, rows in zip(doors, hits, strict=True)
+    ]
+
+
+def _find_hits_on(
+    leaves: Sequence[Cells], recording: Recording, poses: Float, resolution: float
+) -> list[Int64]:
+    """(n, 2) scan of each beam that ended on a leaf, and number of the leaf's cell."""
+    keys = [cell_keys(leaf) for leaf in leaves]
+    orders = [np.argsort(own) for own in keys]
+    hits: list[list[Int64]] = [[np.empty((0, 2), np.int64)] for _ in leaves]
+    for block in iter_blocks(recording.hit) if leaves else ():
         beam = block.start + np.flatnonzero(recording.hit[block])
         scan = recording.scans_of(beam)
-        cells = np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)
-        for mask, rows in zip(masks, seen, strict=True):
-            number = mask.find(cells)
-            on_leaf = np.flatnonzero(number >= 0)
+        key = cell_keys(np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64))
+        for own, order, rows in zip(keys, orders, hits, strict=True):
+            at = np.searchsorted(own, key, sorter=order)
+            number = order[np.minimum(at, len(own) - 1)]
+            on_leaf = np.flatnonzero(own[number] == key)
             rows.append(np.unique(np.column_stack([scan[on_leaf], number[on_leaf]]), axis=0))
-    return [
-        _list_states(mask, np.concatenate(rows), recording.stamp_ns)
-        for mask, rows in zip(masks, seen, strict=True)
-    ]
+    return [np.concatenate(rows) for rows in hits]
 
 
 def observe_leaves(
@@ -61,29 +71,19 @@ def observe_leaves(
     """(L, 2) stamps of the first and the last scan of each second that saw a leaf.
 
     Args:
-        leaves: (K, 2) cells of each; none in common.
+        leaves: (K, 2) cells of each.
         recording, poses, resolution: see `observe_states`.
     """
-    cells = np.concatenate([np.empty((0, 2), np.int64), *leaves])
-    of = np.repeat(np.arange(len(leaves)), [len(leaf) for leaf in leaves])
-    order = np.argsort(cell_keys(cells))
-    keys, of = cell_keys(cells)[order], of[order]
-    seen = [np.empty((0, 2), np.int64)]
-    for block in iter_blocks(recording.hit) if len(keys) else ():
-        beam = block.start + np.flatnonzero(recording.hit[block])
-        key = cell_keys(np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64))
-        at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-        on_leaf = np.flatnonzero(keys[at] == key)
-        seen.append(np.column_stack([recording.scans_of(beam[on_leaf]), at[on_leaf]]))
-    scan, cell = np.concatenate(seen).T
+    hits = _find_hits_on(leaves, recording, poses, resolution)
     return [
-        _list_observations(recording.stamp_ns, scan[mine], cell[mine], _MIN_SHARE * len(leaf))
-        for leaf, mine in ((leaf, of[cell] == k) for k, leaf in enumerate(leaves))
+        _list_observations(rows, recording.stamp_ns, _MIN_SHARE * len(leaf))
+        for leaf, rows in zip(leaves, hits, strict=True)
     ]
 
 
-def _list_observations(stamp_ns: Int64, scan: Int64, cell: Int64, least: float) -> Int64:
+def _list_observations(hits: Int64, stamp_ns: Int64, least: float) -> Int64:
     """(L, 2) first and last stamp of the seconds in which that many cells were hit."""
+    scan, cell = hits.T
     stamps = stamp_ns[scan]
     observations = [
         (stamps[second].min(), stamps[second].max())
@@ -93,28 +93,7 @@ def _list_observations(stamp_ns: Int64, scan: Int64, cell: Int64, least: float) 
     return np.array(observations, np.int64).reshape(-1, 2)
 
 
-class _LeafMask:
-    """Numbers of the cells of both positions in a box from `low` on; -1: none.
-
-    Those of the shut leaf come first, `n_shut` of them, then `n_open`.
-    """
-
-    def __init__(self, door: Door) -> None:
-        cells = np.concatenate([door.shut_cells, door.open_cells])
-        self.low = cells.min(axis=0)
-        self.number = np.full(cells.max(axis=0) - self.low + 1, -1, np.int64)
-        self.number[tuple((cells - self.low).T)] = np.arange(len(cells))
-        self.n_shut, self.n_open = len(door.shut_cells), len(door.open_cells)
-
-    def find(self, cells: Cells) -> Int64:
-        """(N,) the numbers of cells (N, 2)."""
-        out = np.full(len(cells), -1, np.int64)
-        inside = ((cells >= self.low) & (cells < self.low + self.number.shape)).all(axis=1)
-        out[inside] = self.number[tuple((cells[inside] - self.low).T)]
-        return out
-
-
-def _list_states(mask: _LeafMask, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, ...]:
+def _list_states(door: Door, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
     out: list[DoorState] = []
     counts, contradicted = {"shut": 0, "open": 0}, 0
@@ -122,8 +101,9 @@ def _list_states(mask: _LeafMask, hits: Int64, stamp_ns: Int64) -> tuple[DoorSta
     for second in group_indices(bins):
         scans, number = hits[second].T
         number = np.unique(number)
-        n_shut = int(np.count_nonzero(number < mask.n_shut))
-        shares = {"shut": n_shut / mask.n_shut, "open": (len(number) - n_shut) / mask.n_open}
+        n_shut, n_open = len(door.shut_cells), len(door.open_cells)
+        shut = int(np.count_nonzero(number < n_shut))
+        shares = {"shut": shut / n_shut, "open": (len(number) - shut) / n_open}
         contradicted += min(shares.values()) >= _MIN_SHARE
         position: Position = "shut" if shares["shut"] >= shares["open"] else "open"
         if shares[position] < max(_MIN_SHARE, _RATIO * min(shares.values())):
