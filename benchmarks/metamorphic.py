@@ -1,0 +1,401 @@
+"""Recorded logs, changed such that their truth stays: no change may tear the map.
+
+python benchmarks/metamorphic.py FOLDER [--logs NAME ...] [--changes NAME ...] [--seed 0]
+    [--jobs 2] [--out rows.csv] [--keep DIR]
+
+FOLDER holds NAME.clf.gz, CARMEN logs, with NAME.relations or NAME.pseudo.relations, or neither.
+A changed log is written to a file, and `stillmap map` makes a map of it as it does for a user; the
+pieces of a log are given to `stillmap merge` in any order. A change knows which scans it keeps.
+
+error, largest: of the relations between scans that are kept and have a pose, m; ratio: to the error
+of the same relations in the map of the unchanged log, of which `largest_before` is the largest.
+step: the largest from one pose to the next off the odometry of the unchanged log, m/s: by it logs
+without relations are judged. tear: see `TEAR_METRES`. breaks: where the result says that the robot
+was carried; apart: parts that it says lie beside the map, and pieces that it did not place.
+
+A row is appended to --out when its run ends. The table has the ratio, or without relations the
+step, T where the map is torn, "refused" for exit status 2, and DEFECT for any other but 0.
+"""
+
+import csv
+import gzip
+import itertools
+import json
+import math
+import tempfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import session_merging as merging
+from common import make_parser, outcomes
+from numpy.typing import NDArray
+from pairs import name_of, relations_beside
+from tables import Row, grouped, markdown
+
+from stillmap.core import se2
+from stillmap.io.carmen.log import ScanLine, parse_scan
+from stillmap.results.eval.readers import read_planar_trajectory, read_relations
+from stillmap.results.eval.trajectory import MAX_DT, compute_relation_errors, nearest_index
+
+Float = NDArray[np.float64]
+Rng = np.random.Generator
+
+# A map is torn where a relation is off by so many metres, and by so many times the worst of the
+# unchanged log; without relations, where a step is so many m/s off odometry, and likewise.
+TEAR_METRES, TEAR_STEP, TEAR_FACTOR = 2.0, 1.5, 4.0
+
+UNCHANGED = "unchanged"
+_PLACES = 6  # at which a log pauses or has gaps
+_LEAST = 0.04  # of the scans, in a piece
+
+
+class Source(NamedTuple):
+    """The N lines of a log: what scans say, of each stamp, s, and poses of robot and laser (N, 3)
+    as odometry has them; and the lines before them."""
+
+    scans: list[ScanLine | None]
+    stamp: Float
+    pose: Float
+    laser: Float
+    before: list[str]
+
+
+class Log(NamedTuple):
+    """A changed log.
+
+    Attributes:
+        source: the unchanged one.
+        line: (K,) which of its lines, in the order of the file.
+        stamp: (K,) s. pose: (K, 3) of the robot, as odometry has it.
+        fov: rad. reach: m; all that the laser sees.
+    """
+
+    source: Source
+    line: NDArray[np.intp]
+    stamp: Float
+    pose: Float
+    fov: float = math.inf
+    reach: float = math.inf
+
+    @property
+    def scan(self) -> NDArray[np.bool_]:
+        return np.array([self.source.scans[k] is not None for k in self.line.tolist()])
+
+    def part(self, index: NDArray[Any]) -> "Log":
+        """Some of the lines, or all in another order."""
+        return self._replace(line=self.line[index], stamp=self.stamp[index], pose=self.pose[index])
+
+    def in_order(self) -> "Log":
+        return self.part(np.argsort(self.stamp, kind="stable"))
+
+
+def read_log(path: Path) -> Log:
+    with gzip.open(path, "rb") as file:
+        lines = [line.split() for line in file]
+    kinds = (b"ODOM", b"FLASER", b"ROBOTLASER1")
+    words = [line for line in lines if line and line[0] in kinds]
+    scans = [None if line[0] == b"ODOM" else parse_scan(line[0], line[1:]) for line in words]
+    given = [
+        line[1:4] * 2 if scan is None else scan.poses
+        for line, scan in zip(words, scans, strict=True)
+    ]
+    laser, pose = np.array(given, float).reshape(-1, 2, 3).swapaxes(0, 1)
+    stamp = np.array([line[-3] for line in words], float)
+    before = [b" ".join(line).decode() for line in lines if line and line[0] == b"PARAM"]
+    return Log(Source(scans, stamp, pose, laser, before), np.arange(len(words)), stamp, pose)
+
+
+def write_log(log: Log, path: Path) -> None:
+    source, k = log.source, log.line
+    mount = se2.inverse(se2.matrix(*source.pose[k].T)) @ se2.matrix(*source.laser[k].T)
+    laser = se2.parameters(se2.matrix(*log.pose.T) @ mount)
+    texts = list(source.before)
+    for row, line in enumerate(k.tolist()):
+        scan, stamp = source.scans[line], f"{log.stamp[row]:.6f} host {log.stamp[row]:.6f}"
+        poses = [" ".join(f"{x:.6f}" for x in pose[row]) for pose in (laser, log.pose)]
+        if scan is None:
+            texts.append(f"ODOM {poses[1]} 0 0 0 {stamp}")
+        else:
+            texts.append(_scan_text(scan, log, " ".join(poses), stamp))
+    path.write_text("\n".join([*texts, ""]))
+
+
+def _scan_text(scan: ScanLine, log: Log, poses: str, stamp: str) -> str:
+    start, step, longest = scan.config
+    angles = start + step * np.arange(len(scan.ranges))
+    kept = np.abs(angles) < log.fov / 2 + 1e-3
+    # where the laser sees nothing it says its reach
+    n, ranges = kept.sum(), np.minimum(scan.ranges, log.reach)[kept]
+    readings = f"{n} " + " ".join(f"{r:.3f}" for r in ranges)
+    if longest is None and kept.all():  # as it was
+        return f"FLASER {readings} {poses} {stamp}"
+    header = f"{angles[kept][0]:.9f} {(n - 1) * step:.9f} {step:.9f} {longest or 0.0:.3f} 0.01 0"
+    return f"ROBOTLASER1 0 {header} {readings} 0 {poses} 0 0 0 0 0 {stamp}"
+
+
+def pause(log: Log, rng: Rng) -> Log:
+    """At six places the robot rests for 5 to 300 s."""
+    places = rng.uniform(log.stamp.min(), log.stamp.max(), _PLACES)
+    later = places <= log.stamp[:, None]
+    return log._replace(stamp=log.stamp + later @ rng.uniform(5.0, 300.0, _PLACES))
+
+
+def drop(
+    log: Log, rng: Rng, seconds: tuple[float, float], every: float = 0.0, odometry: bool = False
+) -> Log:
+    """Scans are missing for some seconds, at six places or every so often; odometry, too."""
+    count = math.ceil(np.ptp(log.stamp) / every) if every else _PLACES
+    starts = rng.uniform(log.stamp.min(), log.stamp.max(), count)
+    since = log.stamp[:, None] - starts
+    missing = ((since >= 0.0) & (since < rng.uniform(*seconds, count))).any(axis=1)
+    return log.part(~(missing & (log.scan | odometry)))
+
+
+def delay_lines(log: Log, rng: Rng) -> Log:
+    """Of the scans 5 % are written up to 0.9 s late."""
+    late = (log.scan & (rng.random(len(log.line)) < 0.05)) * rng.uniform(0, 0.9, len(log.line))
+    return log.part(np.argsort(np.maximum.accumulate(log.stamp) + late, kind="stable"))
+
+
+def reverse(log: Log, _rng: Rng) -> Log:
+    """Driven backwards, from the end to the start."""
+    both = log.stamp.min() + log.stamp.max()
+    return log.part(np.arange(len(log.line))[::-1])._replace(stamp=both - log.stamp[::-1])
+
+
+def take(log: Log, _rng: Rng, low: float, high: float) -> Log:
+    """The part between two shares of the scans."""
+    first, last = np.quantile(log.stamp[log.scan], [low, high])
+    return log.part((log.stamp >= first) & (log.stamp <= last))
+
+
+def thin(log: Log, rng: Rng, every: int) -> Log:
+    """One scan of so many, and all odometry."""
+    number = np.cumsum(log.scan) + rng.integers(every)
+    return log.part(~log.scan | (number % every == 0))
+
+
+def take_steps(log: Log, rng: Rng, change: Callable[[Float, Float, Rng], Float]) -> Log:
+    """Other odometry: `change` of its steps (K, 3), each up to one of the stamps (K,)."""
+    order = np.argsort(log.stamp, kind="stable")
+    first, T = log.pose[order[0]], se2.matrix(*log.pose[order].T)
+    steps = np.concatenate([np.zeros((1, 3)), se2.parameters(se2.inverse(T[:-1]) @ T[1:])])
+    steps = change(steps, log.stamp[order], rng)
+    theta = first[2] + np.cumsum(steps[:, 2])
+    c, s = np.cos(theta - steps[:, 2]), np.sin(theta - steps[:, 2])
+    x, y = c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]
+    pose = np.empty_like(log.pose)
+    pose[order] = np.column_stack([first[0] + np.cumsum(x), first[1] + np.cumsum(y), theta])
+    return log._replace(pose=pose)
+
+
+def freeze(steps: Float, stamp: Float, rng: Rng) -> Float:
+    """For 10 s, from when the robot moves."""
+    start = stamp[rng.choice(np.flatnonzero(steps[:, :2].any(axis=1)))]
+    return np.where(((stamp >= start) & (stamp < start + 10.0))[:, None], 0.0, steps)
+
+
+def delay_odometry(log: Log, _rng: Rng) -> Log:
+    """Odometry as it was 2 s before."""
+    known = log.in_order()
+    x, y, theta = known.pose.T
+    was = [np.interp(log.stamp - 2.0, known.stamp, some) for some in (x, y, np.unwrap(theta))]
+    return log._replace(pose=np.column_stack(was))
+
+
+def cut(log: Log, rng: Rng, pieces: int) -> list[Log]:
+    """Pieces, in any order."""
+    inner = np.sort(rng.uniform(0.0, 1.0 - _LEAST * pieces, pieces - 1))
+    places = np.quantile(log.stamp[log.scan], inner + _LEAST * np.arange(1, pieces))
+    index = np.searchsorted(places, log.stamp)
+    return [log.part(index == piece) for piece in rng.permutation(pieces).tolist()]
+
+
+CHANGES: dict[str, Callable[[Log, Rng], Log]] = {
+    UNCHANGED: lambda log, _: log,
+    "pauses": pause,
+    "gaps": partial(drop, seconds=(2.0, 30.0)),
+    "gaps-in-both": partial(drop, seconds=(2.0, 30.0), odometry=True),
+    "dropouts": partial(drop, seconds=(0.1, 1.0), every=4.0),
+    "late-lines": delay_lines,
+    "reversed": reverse,
+    "first-half": partial(take, low=0.0, high=0.5),
+    "second-half": partial(take, low=0.5, high=1.0),
+    **{f"every-{k}": partial(thin, every=k) for k in (2, 3, 4, 5)},
+    **{f"fov-{k}": lambda log, _, k=k: log._replace(fov=math.radians(k)) for k in (180, 120, 90)},
+    **{f"range-{k}": lambda log, _, k=k: log._replace(reach=float(k)) for k in (12, 8, 5)},
+    **{
+        f"scale-{k}": lambda log, _, k=k: log._replace(pose=log.pose * (k, k, 1))
+        for k in (0.9, 1.1)
+    },
+    "frozen": partial(take_steps, change=freeze),
+    "no-direction": partial(  # ways back count as ways ahead
+        take_steps, change=lambda steps, *_: np.c_[np.abs(steps[:, 0]), steps[:, 1:]]
+    ),
+    "no-rotation": partial(take_steps, change=lambda steps, *_: steps * (1.0, 1.0, 0.0)),
+    "late-odometry": delay_odometry,
+}
+PIECES = {f"pieces-{k}": k for k in (2, 3, 4, 5)}
+
+
+@dataclass(frozen=True)
+class Job:
+    """A change of a log; `folder` holds the map of the unchanged one, and of each change."""
+
+    path: Path
+    change: str
+    seed: int
+    folder: Path
+
+    def result(self, change: str) -> Path:
+        return self.folder / f"{name_of(self.path)}-{change}"
+
+
+def run(job: Job) -> dict[str, Any]:
+    """A row."""
+    row = {"log": name_of(job.path), "change": job.change, "seed": job.seed}
+    rng = np.random.default_rng([job.seed, *(zlib.crc32(str(row[k]).encode()) for k in row)])
+    log, command = read_log(job.path), ["map"]
+    if pieces := PIECES.get(job.change):
+        logs, command = cut(log, rng, pieces), ["merge"]
+    else:
+        logs = [CHANGES[job.change](log, rng)]
+    with tempfile.TemporaryDirectory() as scratch:
+        for k, some in enumerate(logs):
+            command.append(f"{scratch}/{k}.log")
+            write_log(some, Path(command[-1]))
+        try:
+            words = (*command, "--threads", 1, "-o", job.result(job.change))
+            done = merging.call(merging.default_program(), *words)
+        except RuntimeError as error:
+            print(error, flush=True)
+            return {**row, "status": "DEFECT"}
+    row["cpu"] = round(done.cpu, 1)
+    if done.status == merging.REFUSED:
+        return {**row, "status": "refused"}
+    return {**row, "status": "done", **score(job, log.part(log.scan).in_order(), logs)}
+
+
+def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
+    """What became of a changed log, or of its pieces, beside the scans of the unchanged one."""
+    now = _trajectory(job.result(job.change), logs)
+    then = _trajectory(job.result(UNCHANGED), [log])
+    relations = _known_relations(job.path, log.stamp)
+    both = np.intersect1d(now[:, 0], then[:, 0])
+    relations = relations[np.isin(relations[:, :2], both).all(axis=1)]
+    a, b = (compute_relation_errors(one, relations, max_dt=0.0).translation for one in (now, then))
+    steps = [_largest_step(one, log) for one in (now, then)]
+    worst = (a.max, b.max, TEAR_METRES) if len(relations) else (*steps, TEAR_STEP)
+    run = json.loads((job.result(job.change) / "run.json").read_text())
+    doubts, sessions = run.get("doubts", {}), job.result(job.change) / "sessions.json"
+    places = json.loads(sessions.read_text()) if sessions.exists() else []
+    beside = len(doubts.get("beside_the_map_from", []))
+    return {
+        "scans": len(now),
+        "relations": len(relations),
+        "error": round(a.mean, 4),
+        "ratio": round(a.mean / b.mean, 4),
+        "largest": round(a.max, 3),
+        "largest_before": round(b.max, 3),
+        "step": round(steps[0], 3),
+        "tear": int(worst[0] > max(worst[2], TEAR_FACTOR * worst[1])),
+        "breaks": len(doubts.get("carried_before", [])),
+        "apart": beside + sum(not one["accepted"] for one in places),
+    }
+
+
+def _trajectory(result: Path, logs: Sequence[Log]) -> Float:
+    """(N, 4) t, x, y, theta by the stamps of the unchanged log."""
+    rows = read_planar_trajectory(result / "trajectory.tum")
+    scans = [log.part(log.scan) for log in logs]
+    stamp = np.concatenate([log.stamp for log in scans])
+    was, order = np.concatenate([log.source.stamp[log.line] for log in scans]), np.argsort(stamp)
+    rows[:, 0] = was[order][nearest_index(stamp[order], rows[:, 0])[0]]
+    return rows[np.argsort(rows[:, 0], kind="stable")]
+
+
+def _known_relations(path: Path, scans: Float) -> Float:
+    """(R, 8) between scans of an unchanged log, whose stamps replace those that were rounded."""
+    file = relations_beside(path)
+    if not file.exists():
+        return np.empty((0, 8))
+    relations = read_relations(file)
+    index, off = nearest_index(scans, relations[:, :2].ravel())
+    relations[:, :2] = scans[index].reshape(-1, 2)
+    return relations[(off <= MAX_DT).reshape(-1, 2).all(axis=1)]
+
+
+def _largest_step(poses: Float, log: Log) -> float:
+    """m/s from one pose to the next, off the odometry of the unchanged log."""
+    known = log.pose[nearest_index(log.stamp, poses[:, 0])[0]]
+    T, T_odom = se2.matrix(*poses[:, 1:].T), se2.matrix(*known.T)
+    off = se2.inverse(T[:-1]) @ T[1:] - se2.inverse(T_odom[:-1]) @ T_odom[1:]
+    steps = np.linalg.norm(off[:, :2, 2], axis=1) / np.maximum(np.diff(poses[:, 0]), 1.0)
+    return float(steps.max(initial=0.0))
+
+
+_COLUMNS = (
+    *("log", "change", "seed", "status", "cpu", "scans", "relations", "error", "ratio", "largest"),
+    *("largest_before", "step", "tear", "breaks", "apart"),
+)
+
+
+def main() -> None:
+    some = [*CHANGES, *PIECES]
+    p = make_parser(__doc__)
+    p.add_argument("folder", type=Path)
+    p.add_argument("--logs", nargs="+", help="all of the folder, if none is named")
+    p.add_argument("--changes", nargs="+", choices=some, default=some)
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
+    p.add_argument("--out", type=Path, help="CSV to which rows are appended")
+    p.add_argument("--keep", type=Path, help="folder for results")
+    args = p.parse_args()
+    names = args.logs or sorted(name_of(path) for path in args.folder.glob("*.clf.gz"))
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        # the unchanged logs first: the others are compared with them
+        for changes in ([UNCHANGED], [name for name in args.changes if name != UNCHANGED]):
+            jobs = [
+                Job(args.folder / f"{name}.clf.gz", change, args.seed, args.keep or Path(scratch))
+                for name, change in itertools.product(names, changes)
+            ]
+            for _, row in outcomes(run, jobs, args.jobs):
+                rows.append(row)
+                if args.out:
+                    append(args.out, row)
+    print(table(rows))
+
+
+def append(path: Path, row: Row) -> None:
+    """Append a row to a CSV file, which need not be there."""
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, _COLUMNS)
+        if not file.tell():
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Changes by logs."""
+    logs, lines = list(grouped(rows, lambda row: row["log"])), []
+    for change, some in grouped(rows, lambda row: row["change"]).items():
+        cells = {row["log"]: _cell(row) for row in some}
+        lines.append([change, *(cells.get(log, "") for log in logs)])
+    return markdown(["change", *logs], lines)
+
+
+def _cell(row: Row) -> str:
+    if row["status"] != "done":
+        return str(row["status"])
+    told = f"{row['ratio']:.2f}" if row["relations"] else f"{row['step']:.2f} m/s"
+    return told + " T" * row["tear"]
+
+
+if __name__ == "__main__":
+    main()
