@@ -161,17 +161,6 @@ def result_scores(result: stillmap.Result, cpu_ms: float, run: Prepared) -> Scor
     }
 
 
-def iteration_scores(iteration: stillmap.Iteration, run: Prepared) -> Scores:
-    """Scores of one iteration."""
-    return {
-        **scores(iteration.estimate.p_static, iteration.estimate.poses, iteration.occupancy, run),
-        "iteration": iteration.estimate.number,
-        "seconds": iteration.record.seconds,
-        "bound": iteration.estimate.bound / max(len(iteration.estimate.p_static), 1),
-        "held_out": _or_nan(getattr(iteration, "held_out", None)),
-    }
-
-
 def scores(
     p_static: NDArray[np.floating],
     poses: NDArray[np.float64],

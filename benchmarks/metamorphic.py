@@ -56,13 +56,12 @@ _LEAST = 0.04  # of the scans, in a piece
 
 class Source(NamedTuple):
     """The N lines of a log: what scans say, of each stamp, s, and poses of robot and laser (N, 3)
-    as odometry has them; and the lines before them."""
+    as odometry has them."""
 
     scans: list[ScanLine | None]
     stamp: Float
     pose: Float
     laser: Float
-    before: list[str]
 
 
 class Log(NamedTuple):
@@ -95,26 +94,22 @@ class Log(NamedTuple):
 
 
 def read_log(path: Path) -> Log:
-    with gzip.open(path, "rb") as file:
-        lines = [line.split() for line in file]
+    """The scans and the odometry of a log; no other line."""
     kinds = (b"ODOM", b"FLASER", b"ROBOTLASER1")
-    words = [line for line in lines if line and line[0] in kinds]
+    with gzip.open(path, "rb") as file:
+        words = [line.split() for line in file if line.startswith(kinds)]
     scans = [None if line[0] == b"ODOM" else parse_scan(line[0], line[1:]) for line in words]
-    given = [
-        line[1:4] * 2 if scan is None else scan.poses
-        for line, scan in zip(words, scans, strict=True)
-    ]
+    given = [words[k][1:4] * 2 if scan is None else scan.poses for k, scan in enumerate(scans)]
     laser, pose = np.array(given, float).reshape(-1, 2, 3).swapaxes(0, 1)
     stamp = np.array([line[-3] for line in words], float)
-    before = [b" ".join(line).decode() for line in lines if line and line[0] == b"PARAM"]
-    return Log(Source(scans, stamp, pose, laser, before), np.arange(len(words)), stamp, pose)
+    return Log(Source(scans, stamp, pose, laser), np.arange(len(words)), stamp, pose)
 
 
 def write_log(log: Log, path: Path) -> None:
     source, k = log.source, log.line
     mount = se2.inverse(se2.matrix(*source.pose[k].T)) @ se2.matrix(*source.laser[k].T)
     laser = se2.parameters(se2.matrix(*log.pose.T) @ mount)
-    texts = list(source.before)
+    texts = []
     for row, line in enumerate(k.tolist()):
         scan, stamp = source.scans[line], f"{log.stamp[row]:.6f} host {log.stamp[row]:.6f}"
         poses = [" ".join(f"{x:.6f}" for x in pose[row]) for pose in (laser, log.pose)]
@@ -216,7 +211,7 @@ def cut(log: Log, rng: Rng, pieces: int) -> list[Log]:
     return [log.part(index == piece) for piece in rng.permutation(pieces).tolist()]
 
 
-CHANGES: dict[str, Callable[[Log, Rng], Log]] = {
+CHANGES: dict[str, Callable[[Log, Rng], Log | list[Log]]] = {
     UNCHANGED: lambda log, _: log,
     "pauses": pause,
     "gaps": partial(drop, seconds=(2.0, 30.0)),
@@ -239,8 +234,8 @@ CHANGES: dict[str, Callable[[Log, Rng], Log]] = {
     ),
     "no-rotation": partial(take_steps, change=lambda steps, *_: steps * (1.0, 1.0, 0.0)),
     "late-odometry": delay_odometry,
+    **{f"pieces-{k}": partial(cut, pieces=k) for k in (2, 3, 4, 5)},
 }
-PIECES = {f"pieces-{k}": k for k in (2, 3, 4, 5)}
 
 
 @dataclass(frozen=True)
@@ -252,49 +247,46 @@ class Job:
     seed: int
     folder: Path
 
-    def result(self, change: str) -> Path:
-        return self.folder / f"{name_of(self.path)}-{change}"
+    def result(self, change: str = "") -> Path:
+        return self.folder / f"{name_of(self.path)}-{change or self.change}"
 
 
 def run(job: Job) -> dict[str, Any]:
     """A row."""
     row = {"log": name_of(job.path), "change": job.change, "seed": job.seed}
-    rng = np.random.default_rng([job.seed, *(zlib.crc32(str(row[k]).encode()) for k in row)])
-    log, command = read_log(job.path), ["map"]
-    if pieces := PIECES.get(job.change):
-        logs, command = cut(log, rng, pieces), ["merge"]
-    else:
-        logs = [CHANGES[job.change](log, rng)]
+    rng = np.random.default_rng([job.seed, zlib.crc32(f"{row['log']} {job.change}".encode())])
+    log = read_log(job.path)
+    changed = CHANGES[job.change](log, rng)
+    logs = changed if isinstance(changed, list) else [changed]
     with tempfile.TemporaryDirectory() as scratch:
-        for k, some in enumerate(logs):
-            command.append(f"{scratch}/{k}.log")
-            write_log(some, Path(command[-1]))
+        files = [Path(scratch, f"{k}.log") for k in range(len(logs))]
+        for some, file in zip(logs, files, strict=True):
+            write_log(some, file)
+        words = ("merge" if len(files) > 1 else "map", *files, "--threads", 1)
         try:
-            words = (*command, "--threads", 1, "-o", job.result(job.change))
-            done = merging.call(merging.default_program(), *words)
+            done = merging.call(merging.default_program(), *words, "-o", job.result())
         except RuntimeError as error:
             print(error, flush=True)
             return {**row, "status": "DEFECT"}
     row["cpu"] = round(done.cpu, 1)
     if done.status == merging.REFUSED:
         return {**row, "status": "refused"}
-    return {**row, "status": "done", **score(job, log.part(log.scan).in_order(), logs)}
+    return {**row, "status": "done", **score(job, log, logs)}
 
 
 def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
-    """What became of a changed log, or of its pieces, beside the scans of the unchanged one."""
-    now = _trajectory(job.result(job.change), logs)
+    """What became of a changed log, or of its pieces, beside the unchanged one."""
+    now = _trajectory(job.result(), logs)
     then = _trajectory(job.result(UNCHANGED), [log])
-    relations = _known_relations(job.path, log.stamp)
-    both = np.intersect1d(now[:, 0], then[:, 0])
+    relations, both = _known_relations(job.path, log), np.intersect1d(now[:, 0], then[:, 0])
     relations = relations[np.isin(relations[:, :2], both).all(axis=1)]
     a, b = (compute_relation_errors(one, relations, max_dt=0.0).translation for one in (now, then))
     steps = [_largest_step(one, log) for one in (now, then)]
     worst = (a.max, b.max, TEAR_METRES) if len(relations) else (*steps, TEAR_STEP)
-    run = json.loads((job.result(job.change) / "run.json").read_text())
-    doubts, sessions = run.get("doubts", {}), job.result(job.change) / "sessions.json"
-    places = json.loads(sessions.read_text()) if sessions.exists() else []
-    beside = len(doubts.get("beside_the_map_from", []))
+    doubts = json.loads((job.result() / "run.json").read_text()).get("doubts", {})
+    sessions = job.result() / "sessions.json"
+    pieces = json.loads(sessions.read_text()) if sessions.exists() else []
+    apart = [*doubts.get("beside_the_map_from", []), *(p for p in pieces if not p["accepted"])]
     return {
         "scans": len(now),
         "relations": len(relations),
@@ -305,7 +297,7 @@ def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
         "step": round(steps[0], 3),
         "tear": int(worst[0] > max(worst[2], TEAR_FACTOR * worst[1])),
         "breaks": len(doubts.get("carried_before", [])),
-        "apart": beside + sum(not one["accepted"] for one in places),
+        "apart": len(apart),
     }
 
 
@@ -319,12 +311,10 @@ def _trajectory(result: Path, logs: Sequence[Log]) -> Float:
     return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
-def _known_relations(path: Path, scans: Float) -> Float:
+def _known_relations(path: Path, log: Log) -> Float:
     """(R, 8) between scans of an unchanged log, whose stamps replace those that were rounded."""
-    file = relations_beside(path)
-    if not file.exists():
-        return np.empty((0, 8))
-    relations = read_relations(file)
+    file, scans = relations_beside(path), np.sort(log.stamp[log.scan])
+    relations = read_relations(file) if file.exists() else np.empty((0, 8))
     index, off = nearest_index(scans, relations[:, :2].ravel())
     relations[:, :2] = scans[index].reshape(-1, 2)
     return relations[(off <= MAX_DT).reshape(-1, 2).all(axis=1)]
@@ -332,7 +322,8 @@ def _known_relations(path: Path, scans: Float) -> Float:
 
 def _largest_step(poses: Float, log: Log) -> float:
     """m/s from one pose to the next, off the odometry of the unchanged log."""
-    known = log.pose[nearest_index(log.stamp, poses[:, 0])[0]]
+    scans = log.part(log.scan).in_order()
+    known = scans.pose[nearest_index(scans.stamp, poses[:, 0])[0]]
     T, T_odom = se2.matrix(*poses[:, 1:].T), se2.matrix(*known.T)
     off = se2.inverse(T[:-1]) @ T[1:] - se2.inverse(T_odom[:-1]) @ T_odom[1:]
     steps = np.linalg.norm(off[:, :2, 2], axis=1) / np.maximum(np.diff(poses[:, 0]), 1.0)
@@ -346,11 +337,10 @@ _COLUMNS = (
 
 
 def main() -> None:
-    some = [*CHANGES, *PIECES]
     p = make_parser(__doc__)
     p.add_argument("folder", type=Path)
     p.add_argument("--logs", nargs="+", help="all of the folder, if none is named")
-    p.add_argument("--changes", nargs="+", choices=some, default=some)
+    p.add_argument("--changes", nargs="+", choices=CHANGES, default=list(CHANGES))
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
     p.add_argument("--out", type=Path, help="CSV to which rows are appended")
@@ -359,11 +349,12 @@ def main() -> None:
     names = args.logs or sorted(name_of(path) for path in args.folder.glob("*.clf.gz"))
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as scratch:
+        folder = args.keep or Path(scratch)
         # the unchanged logs first: the others are compared with them
         for changes in ([UNCHANGED], [name for name in args.changes if name != UNCHANGED]):
+            pairs = itertools.product(names, changes)
             jobs = [
-                Job(args.folder / f"{name}.clf.gz", change, args.seed, args.keep or Path(scratch))
-                for name, change in itertools.product(names, changes)
+                Job(args.folder / f"{log}.clf.gz", one, args.seed, folder) for log, one in pairs
             ]
             for _, row in outcomes(run, jobs, args.jobs):
                 rows.append(row)
@@ -383,10 +374,9 @@ def append(path: Path, row: Row) -> None:
 
 def table(rows: Sequence[Row]) -> str:
     """Changes by logs."""
-    logs, lines = list(grouped(rows, lambda row: row["log"])), []
-    for change, some in grouped(rows, lambda row: row["change"]).items():
-        cells = {row["log"]: _cell(row) for row in some}
-        lines.append([change, *(cells.get(log, "") for log in logs)])
+    cells = {(row["change"], row["log"]): _cell(row) for row in rows}
+    changes, logs = (list(grouped(rows, lambda row, k=k: row[k])) for k in ("change", "log"))
+    lines = [[one, *(cells.get((one, log), "") for log in logs)] for one in changes]
     return markdown(["change", *logs], lines)
 
 

@@ -66,12 +66,7 @@ MOVERS = (
     *(replace(c, key=c.key + NO_DOORS, title=f"{c.title} without doors") for c in OF_DOORS),
 )
 COST = (Column("iterations", "iterations", ".1f"), Column("cpu", "CPU ms per scan", ".2f"))
-PER_ITERATION = (
-    Column("bound", "bound per beam", ".5f", True),
-    Column("held_out", "held out per beam", ".5f", True),
-    Column("seconds", "s", ".2f"),
-)
-BY_KEY = {column.key: column for column in (*LABELS, *MOVERS, *MAP, *COST, *PER_ITERATION)}
+BY_KEY = {column.key: column for column in (*LABELS, *MOVERS, *MAP, *COST)}
 
 
 def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
