@@ -53,9 +53,9 @@ def test_it_is_a_known_map(place):
     np.save(place / "live/known_route.npy", np.eye(4)[None])
     kept = open_cloud(place)
     assert kept.route.shape == (3, 4, 4)
-    p_occupied = KnownMap(place).in_map_frame.p_occupied
+    p_occupied = KnownMap(place).grid.p_occupied
     put_map(place, p_occupied=p_occupied.astype(np.longdouble))
-    np.testing.assert_array_equal(KnownMap(place).in_map_frame.p_occupied, p_occupied)
+    np.testing.assert_array_equal(KnownMap(place).grid.p_occupied, p_occupied)
     assert kept.stands.any()
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from stillmap.core.config import CheckedOptions
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
 from stillmap.core.source import RangeRule, Source
@@ -79,7 +78,11 @@ class FakeResult:
     doubts: Diagnostics = field(default_factory=Diagnostics)
     calibration: Calibration = field(default_factory=Calibration)
     quality: Quality = field(default_factory=Quality)
-    frame: LocalFrame = field(default_factory=LocalFrame)
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def near(self):
+        return self
 
     @property
     def deskewed(self) -> Recording:

@@ -168,5 +168,5 @@ def _build_cloud(
         labels.p_static,
         args.only,
         colors,
-        result.read_frame().origin,
+        result.read_origin(),
     )

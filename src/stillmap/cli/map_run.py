@@ -202,13 +202,14 @@ def _map_tilting_laser(
     result: MappingResult, tilting: Recording, options: Options
 ) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
-    from stillmap.pipeline.map_frame import Shift, shift
+    from stillmap.core.local_frame import Shift, shift
+    from stillmap.pipeline.map_frame import FIELDS
     from stillmap.pipeline.tilting import PlanarResult, build_tilting
 
     near, threads = result.near, resolve_threads(options.threads)
     planar = PlanarResult(near.deskewed, near.poses, near.p_static, near.objects)
     built = build_tilting(planar, tilting, options.em, threads)
-    return shift(built, Shift(result.frame.origin))
+    return dataclasses.replace(shift(built, Shift(result.origin), FIELDS), local=built)
 
 
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")

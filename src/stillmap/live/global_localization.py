@@ -12,7 +12,6 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.core.local_frame import LocalFrame
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
 from stillmap.live.known_map import KeptMap, KnownLocalMap, KnownMap, to_surface_map
 from stillmap.live.local_map import LocalMap
@@ -173,17 +172,17 @@ class PlanarLocalizer:
         extends: whether scans are added to it.
 
     Attributes:
-        frame: of the search, in the map frame.
+        origin: (3,) m, of the frame of the search, in the map frame.
         is_lost: the robot is not found in it yet.
         is_ambiguous: several places fit about as well.
         route: (T, D) from where the map was made, in 3D, once the robot is found in it.
     """
 
-    frame, is_lost, is_ambiguous = LocalFrame(), True, False
-    route = np.zeros((0, 2))
+    is_lost, is_ambiguous = True, False
+    origin, route = np.zeros(3), np.zeros((0, 2))
 
     def __init__(self, known: KnownMap, extends: bool) -> None:
-        self.frame, self._known, self._extends = known.frame, known, extends
+        self.origin, self._known, self._extends = known.origin, known, extends
         self._global: GlobalLocalizer | None
         self._global = GlobalLocalizer(known, sure_agree=MIN_AGREE_ANYWHERE)
 
@@ -224,7 +223,7 @@ class PlanarLocalizer:
 
     def keep(self, _labels: CausalLabels) -> KeptMap:
         """The part of the map that an extended one keeps, as of now: all of it."""
-        return KeptMap(self._known.in_map_frame, self._known.hits)
+        return KeptMap(self._known.grid, self._known.hits)
 
 
 class OwnMap(PlanarLocalizer):

@@ -8,18 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.array_folder import open_npy
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import InputError
-from stillmap.core.local_frame import LocalFrame
 from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
-from stillmap.io.trajectory import are_rigid, read_tum
-from stillmap.live.known_map import LOG_RATIO, ROUTE, KeptMap, KnownMap
+from stillmap.live.known_map import LOG_RATIO, KeptMap, KnownMap
 from stillmap.live.sweep_view import STANDS, count_up, is_level
 from stillmap.places.evidence import cell_keys
-from stillmap.results.point_cloud import cloud_from_folder
+from stillmap.results.near_result import NearResult
 from stillmap.slam import lidar_odometry
 
 _STATIC = 0.5  # P(static) of the points that are added: over hours others would fill the cells
@@ -85,9 +82,9 @@ class KnownCloud:
         if not (folder / "static.ply").exists():
             hint = "sweeps are localized in the result of a spinning lidar"
             raise InputError("holds no static.ply", where=str(source), hint=hint)
-        self.planar = planar
-        self.poses = planar.frame.to_local(_read_route(folder))
-        points, p_static = _read_points(folder, planar.frame)
+        self.planar, near = planar, NearResult(folder, planar.origin)
+        self.poses = near.read_route()
+        points, p_static = _read_points(near)
         # cells of planes take in so many points only, which must not all lie on one side
         order = np.random.default_rng(0).permutation(len(points))
         self.points, self.p_static = points[order], p_static[order]
@@ -126,7 +123,7 @@ class KnownCloud:
         stands, planar = np.ones(len(self.points), np.bool_), self.planar
         if now is not None:
             stands = _find_standing(self.points, now, p_unseen, edge)
-        grid, hits = planar.in_map_frame, np.array(planar.hits)
+        grid, hits = planar.grid, np.array(planar.hits)
         z = self.points[:, 2] - self.ground.height_at(self.points[:, :2].astype(np.float64))
         is_obstacle = (z >= band[0]) & (z <= band[1])
         there, gone = (
@@ -139,9 +136,9 @@ class KnownCloud:
             replace(grid, p_occupied=p_occupied),
             hits,
             there & grid.occupied,
-            planar.frame.points_to_map(self.points[stands]),
+            self.points[stands].astype(np.float64),
             self.p_static[stands],
-            planar.frame.to_map(thin_route(self.poses)),
+            thin_route(self.poses),
         )
 
     def _columns(self, points: Float32) -> Bool:
@@ -215,35 +212,20 @@ def _look_up(now: CellProbabilities, cells: Int64) -> Float:
     return np.where(keys[known] == sought, now.p_occupied[known], 1.0)
 
 
-def _read_route(folder: Path) -> Float:
-    """(T, 4, 4) poses of a result and of a map that it extends, or of all sessions of a place."""
-    single = folder / "trajectory.tum"
-    paths = [single] if single.exists() else sorted(folder.glob("sessions/*/trajectory.tum"))
-    poses = [read_tum(path)[1] for path in paths]
-    if (folder / ROUTE).exists():
-        route = open_npy(folder / ROUTE)
-        if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not are_rigid(route):
-            raise InputError("holds no poses", where=str(folder / ROUTE))
-        poses.append(route)
-    if not sum(map(len, poses)):
-        raise InputError("holds no trajectory", where=str(folder))
-    return np.concatenate(poses)
-
-
-def _read_points(folder: Path, frame: LocalFrame) -> tuple[Float32, Float32]:
-    """(N, 3) the mean of the points in every voxel, in a frame, and (N,) their mean P(static)."""
+def _read_points(near: NearResult) -> tuple[Float32, Float32]:
+    """(N, 3) the mean of the points in every voxel, and (N,) their mean P(static)."""
     parts = [(np.zeros((0, 3), np.int64), np.zeros((0, 5)))]
-    for block in cloud_from_folder(folder, "static").iter_blocks():
-        points = frame.points_to_local(block.points)
+    for block in near.iter_points():
+        points = block.points
         if not (np.abs(points) < _MAX_EXTENT).all():
             what = f"holds a point more than {_MAX_EXTENT / 1e3:g} km from its planar map"
-            raise InputError(what, where=str(folder / "static.ply"))
+            raise InputError(what, where=str(near.folder / "static.ply"))
         more = np.column_stack([points, block.p_static, np.ones(len(points))])
         cells = np.floor(points / _SPACING).astype(np.int64)
         parts.append(_sum_up(cells, more))
     keys, sums = _sum_up(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     if not len(keys):
-        raise InputError("has an empty map", where=str(folder / "static.ply"))
+        raise InputError("has an empty map", where=str(near.folder / "static.ply"))
     means = (sums[:, :4] / sums[:, 4:]).astype(np.float32)
     return np.ascontiguousarray(means[:, :3]), np.ascontiguousarray(means[:, 3])
 

@@ -1,6 +1,5 @@
 """A known map for localization, and what an extended one keeps of it."""
 
-import dataclasses
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.live.causal_labels import OccupancyFilter
@@ -25,13 +22,12 @@ from stillmap.pipeline.options import MapMode
 from stillmap.places.evidence import cell_keys
 from stillmap.places.surface_map import SurfaceMap, find_sides
 from stillmap.results import reader
-from stillmap.results.folder import ResultFolder
 from stillmap.results.map_server import write_map_npz, write_map_server
+from stillmap.results.near_result import ROUTE, NearResult
 from stillmap.results.point_cloud import Block, append_vertices, cloud_from_folder
-from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, RECORD, Grid, read_run
+from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, Grid
 from stillmap.slam import scan_hits
 
-ROUTE = "live/known_route.npy"  # of a result that extends a map, from where that one was made
 Layer = NDArray[np.floating]
 
 _SQUARE = 2  # cells along the edge of a square of the surface map
@@ -64,7 +60,7 @@ def write_extended_cloud(folder: Path, kept: "KeptMap", edge: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class KeptMap(ShortRepr):
-    """The part of a known map that an extended one keeps, in its map frame.
+    """The part of a known map that an extended one keeps.
 
     Attributes:
         grid: the planar map.
@@ -152,7 +148,7 @@ class KnownMap:
         source: folder of a result or a place, or a map.
 
     Attributes:
-        frame: near the map, in its map frame: all else here is in it.
+        origin: (3,) m, in the map frame, of the frame that all here is in; zero: that one.
         grid: the map.
         hits: (H, W) sums of hits of its cells.
         resolution: m, edge of a cell.
@@ -163,26 +159,20 @@ class KnownMap:
     """
 
     def __init__(self, source: str | os.PathLike[str] | GridMap) -> None:
+        self.origin = np.zeros(3)
         if isinstance(source, GridMap):
             self.grid = Grid(source.p_occupied, source.origin, source.resolution)
             self.hits = self.grid.p_occupied
         else:
-            self.grid = reader.read_grid(Path(source))
-            self.hits = reader.read_hit_sums(Path(source), self.grid.p_occupied.shape)
-        self.frame = _find_frame(source, self.grid)
-        corner = self.frame.corner_to_local(self.grid.origin)
-        self.grid = dataclasses.replace(self.grid, origin=corner)
+            near, self.grid = NearResult.open_map(Path(source))
+            self.hits = reader.read_hit_sums(near.folder, self.grid.p_occupied.shape)
+            self.origin = near.origin
         if not self.grid.occupied.any():
             where = "map" if isinstance(source, GridMap) else str(source)
             raise InputError("has an empty map", where=where)
         self.resolution = self.grid.resolution
         self._centres = self.grid.centres(np.argwhere(self.grid.occupied))
         self.surfaces = _find_surfaces(self.grid, self.hits)
-
-    @property
-    def in_map_frame(self) -> Grid:
-        """The map where it was."""
-        return dataclasses.replace(self.grid, origin=self.frame.corner_to_map(self.grid.origin))
 
     def make_grid(self) -> _core.OccupancyGrid2D:
         """The map for registration: an end point for every occupied cell, and free space."""
@@ -292,12 +282,3 @@ def _free_runs(grid: Grid) -> tuple[Float, Float]:
     poses[:, :2, :2] = [[c, -s], [s, c]]
     poses[:, :2, 2] = begins
     return poses, np.asarray((last - first - 1) * grid.resolution, np.float64)
-
-
-def _find_frame(source: str | os.PathLike[str] | GridMap, grid: GridMap) -> LocalFrame:
-    """The frame in which a result was computed, with whose cells those of its map agree."""
-    if not isinstance(source, GridMap) and (Path(source) / RECORD).is_file():
-        noted = ResultFolder(Path(source), read_run(Path(source))).read_frame()
-        if noted.is_shifted:
-            return noted
-    return LocalFrame.near(se2.matrix(*grid.origin)[None])

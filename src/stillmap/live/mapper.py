@@ -175,16 +175,14 @@ class LiveMapper:
             band = output.min_obstacle_height, output.max_obstacle_height
             cells, route = labels.known_cells(), self._slam.route()
             grid = project_obstacles(cells, route, band, self.resolution)
-        origin = self._slam.known_frame.corner_to_map(grid.origin)
-        return dataclasses.replace(grid, origin=origin)
+        return self._slam.in_map_frame(grid)
 
     @property
     def cells(self) -> CellProbabilities:
         """P(static and occupied) of the cells, in 3D voxels, in which beams ended."""
         if self._slam is None:
             return CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0.0)
-        known = self._slam.labels.known_cells()
-        return dataclasses.replace(known, cells=known.cells + self._slam.cell_shift)
+        return self._slam.in_map_frame(self._slam.labels.known_cells())
 
     @property
     def resolution(self) -> float:

@@ -4,22 +4,24 @@ import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32, Int64
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.grid_map import GridMap
+from stillmap.core.local_frame import Fields, Shift, shift, shift_poses
 from stillmap.core.parallel import resolve_threads
-from stillmap.live.causal_labels import CausalLabels
+from stillmap.em import CellProbabilities
+from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.front_end import Registration
 from stillmap.live.history import History
 from stillmap.live.known_map import KeptMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_process import LoopProcess, make_closer
 from stillmap.live.map_frame import FrontEnd, LoopClosing, MapFrame, rotate_covariance
-from stillmap.live.movers import MoverTracker
+from stillmap.live.movers import Mover, MoverTracker
 from stillmap.live.robot_finder import Localizer, RobotFinder
 from stillmap.live.scan import BeamSelector, Observation, ScanBeams, deskew, find_margins
 from stillmap.live.scan_odometry import ScanOdometry, thin
@@ -27,6 +29,17 @@ from stillmap.live.sweep_odometry import SweepOdometry
 from stillmap.live.update import LaterLabels, Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam.scan_hits import Scan as PlanarHits
+
+# fields that depend on the frame
+_FIELDS: Fields = {
+    Update: {"pose": "poses", "T_map_odom": "poses", "changes": "part", "movers": "part"},
+    MapChange: {"first_cell": "cells"},
+    Mover: {"position": "points"},
+    KeptMap: {"grid": "part", "points": "points", "route": "poses"},
+    GridMap: {"origin": "corner"},
+    CellProbabilities: {"cells": "cells"},
+}
+Told = TypeVar("Told", Update, GridMap, CellProbabilities)
 
 _SEARCH_DISTANCE = 0.5  # m between the sweeps with which a robot is searched in a known map
 
@@ -112,7 +125,8 @@ class OnlineSlam:
         self._movers.add(deskewed, registered.T, p_static)
         self._T_odom_base = T_odom_base
         update = self._to_update(beams.stamp_ns, registered, p_static)
-        answer, p_static = self.known_frame.to_map(pose), p_static.copy()  # the user has the other
+        answer = shift_poses(pose, self._to_map.metres)
+        p_static = p_static.copy()  # the user has the other
 
         def keep() -> MappedScan | None:
             self.history.append(
@@ -130,11 +144,10 @@ class OnlineSlam:
 
         if not self._finder.is_lost:
             self._work_left = keep
-            return update
-        added = keep()
-        if added is None or not self._finder.is_lost:
-            return update
-        return self._find_robot(thin(hits) if isinstance(hits, PlanarHits) else added, update)
+        elif (added := keep()) is not None and self._finder.is_lost:
+            scan = thin(hits) if isinstance(hits, PlanarHits) else added
+            update = self._find_robot(scan, update)
+        return self.in_map_frame(update)
 
     def update_map(self) -> None:
         """Keep the last scan and add it to the maps, unless that is done: the answer to it does not
@@ -162,25 +175,31 @@ class OnlineSlam:
         if self._place is None:  # in a known map that frame is the map's
             poses = self.frame.to_map_all(poses, notes["anchor"], is_whole)
         submaps = self._finder.submaps(len(poses))
-        if self._place is not None and self._place.frame.is_shifted:
-            poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
+        if self._place is not None:
+            placed = shift_poses(poses, self._place.origin)
+            poses = np.where((submaps == 0)[:, None, None], placed, poses)
         return poses, submaps
 
     def keep_map(self) -> KeptMap | None:
         """The part of a known map that an extended one keeps, as of now; None: no such map."""
-        return None if self._place is None else self._place.keep(self.labels)
+        if self._place is None:
+            return None
+        return shift(self._place.keep(self.labels), Shift(self._place.origin), _FIELDS)
 
     @property
-    def known_frame(self) -> LocalFrame:
-        """The frame in which a known map is searched, and poses are once the robot is found, in its
-        map frame; else the map frame itself."""
-        if self._place is None or self._finder.is_lost:
-            return LocalFrame()
-        return self._place.frame
+    def _to_map(self) -> Shift:
+        """From the frame that all here is in to the map frame: in a known map, once the robot is
+        found, that one has its own."""
+        known = None if self._finder.is_lost else self._place
+        return Shift.of(np.zeros(3) if known is None else known.origin, self.resolution)
+
+    def in_map_frame(self, value: Told) -> Told:
+        """An update, map or cells, in the map frame."""
+        return shift(value, self._to_map, _FIELDS)
 
     def path(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans since the robot was found or lost."""
-        return self.known_frame.to_map(self._path())
+        return shift_poses(self._path(), self._to_map.metres)
 
     def _path(self) -> Float:
         return self.frame.spaced_poses()[self._path_begin :]
@@ -258,7 +277,7 @@ class OnlineSlam:
         self._path_begin = frame.last + 1 if self._place is not None else 0
         self._movers.move(T)
         T_map_odom = update.T_map_odom
-        found = dataclasses.replace(
+        return dataclasses.replace(
             update,
             pose=motion @ update.pose,
             covariance=rotate_covariance(update.covariance, motion),
@@ -266,7 +285,6 @@ class OnlineSlam:
             doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
             movers=self._movers.movers(frame.T_map_local),
         )
-        return dataclasses.replace(self._in_map_frame(found), changes=update.changes)
 
     def _to_update(self, stamp_ns: int, registered: Registration, p_static: Float32) -> Update:
         doubts = {
@@ -279,7 +297,7 @@ class OnlineSlam:
         }
         T, T_odom_base = self.frame.T_map_local, self._T_odom_base
         pose = T @ registered.T
-        update = Update(
+        return Update(
             pose,
             rotate_covariance(registered.covariance, T),
             p_static,
@@ -289,7 +307,6 @@ class OnlineSlam:
             self._movers.movers(T),
             list(self._label_recent(stamp_ns)),
         )
-        return self._in_map_frame(update)
 
     def _label_recent(self, stamp_ns: int) -> Iterator[LaterLabels]:
         """Labels of the scans that are old enough now, and have none of later yet."""
@@ -297,31 +314,6 @@ class OnlineSlam:
             number, beams = self._recent.popleft()
             if number < self.history.kept:
                 yield LaterLabels(number, self.label(beams, number))
-
-    def _in_map_frame(self, update: Update) -> Update:
-        """An update whose poses are in the frame of the search in a known map."""
-        known, T = self.known_frame, update.T_map_odom
-        if not known.is_shifted:
-            return update
-        return dataclasses.replace(
-            update,
-            pose=known.to_map(update.pose),
-            T_map_odom=None if T is None else known.to_map(T),
-            changes=[
-                dataclasses.replace(change, first_cell=change.first_cell + self.cell_shift)
-                for change in update.changes
-            ],
-            movers=[
-                dataclasses.replace(mover, position=known.points_to_map(mover.position))
-                for mover in update.movers
-            ],
-        )
-
-    @property
-    def cell_shift(self) -> Int64:
-        """(D,) by which the labels' cells are shifted in the map frame."""
-        shift = self.known_frame.origin[: self.dimension] / self.resolution
-        return np.asarray(np.round(shift), np.int64)
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
         """(D+1, D+1) of odometry since the last scan; None: not known."""

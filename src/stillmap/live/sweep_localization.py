@@ -35,13 +35,13 @@ class SweepLocalizer:
         threads: the result does not depend on it.
 
     Attributes:
-        frame, is_lost, is_ambiguous: see PlanarLocalizer.
+        origin, is_lost, is_ambiguous: see PlanarLocalizer.
     """
 
     is_lost, is_ambiguous = True, False
 
     def __init__(self, known: KnownCloud, extends: bool, options: Options, threads: int) -> None:
-        self.frame, self._extends, output = known.planar.frame, extends, options.output
+        self.origin, self._extends, output = known.planar.origin, extends, options.output
         self._known, self._threads = known, threads
         self._band = output.min_obstacle_height, output.max_obstacle_height
         self._edge = resolve_resolution(options, 3).slam.resolution

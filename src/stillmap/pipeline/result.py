@@ -7,9 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stillmap import em, slam
 from stillmap.core.array_types import Float, Float32
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.local_frame import shift
 from stillmap.core.parallel import limit_blas_threads, resolve_threads, trim_heap, work_beside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
@@ -19,7 +21,7 @@ from stillmap.pipeline.calibration import correct_recording
 from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import EmState, Estimate, IterationRecord, iterate
 from stillmap.pipeline.final_map import FinalEstimate, Maps, final_estimate, find_objects, make_maps
-from stillmap.pipeline.map_frame import Shift, enter_local_frame, move_odometry, shift
+from stillmap.pipeline.map_frame import FIELDS, enter_local_frame, move_odometry, to_map_frame
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
@@ -48,8 +50,8 @@ class MappingResult(ShortRepr):
         stages: seconds and peak memory.
         calibration: poses of the lasers and errors of odometry, as the motion shows them.
         quality: of labels and geometry, from 0 to 100.
-        frame: in which it was computed; everything here is in the map frame.
-        local: the same in `frame`; None: that is the map frame.
+        origin: (3,) m, of the frame in which it was computed; all here is in the map frame.
+        local: the same in that frame; None: it is the map frame.
     """
 
     recording: Recording
@@ -67,12 +69,12 @@ class MappingResult(ShortRepr):
     stages: Mapping[str, Mapping[str, Any]]
     calibration: Calibration = field(default_factory=Calibration)
     quality: Quality = field(default_factory=Quality)
-    frame: LocalFrame = field(default_factory=LocalFrame)
+    origin: Float = field(default_factory=lambda: np.zeros(3))
     local: "MappingResult | None" = field(default=None, repr=False)
 
     @property
     def near(self) -> "MappingResult":
-        """The same in `frame`, near the robot, where coordinates of 32 bits are precise."""
+        """The same in a frame near the robot, where coordinates of 32 bits are precise."""
         return self if self.local is None else self.local
 
     @property
@@ -167,7 +169,7 @@ def map_recording(
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
-    frame, odometry, recording, poses = enter_local_frame(recording, poses)
+    origin, odometry, recording, poses = enter_local_frame(recording, poses)
     progress("calibrating", 0, 0, 0)
     with stages.measure("calibration"):
         recording, options, calibration, notes = correct_recording(recording, options, poses)
@@ -186,11 +188,11 @@ def map_recording(
             _run_em(recording, state, None, progress, stages, checkpoint)
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
-    recording = move_odometry(recording, odometry.origin)
+    recording = move_odometry(recording, odometry)
     result = dataclasses.replace(
         result, recording=recording, calibration=calibration, warnings=warnings
     )
-    return _to_map_frame(result, frame)
+    return _leave_local_frame(result, origin)
 
 
 def _run_em(
@@ -276,11 +278,11 @@ def _track_and_rate(
             return objects, rated()
 
 
-def _to_map_frame(result: MappingResult, frame: LocalFrame) -> MappingResult:
+def _leave_local_frame(result: MappingResult, origin: Float) -> MappingResult:
     """A result that was computed in a frame near the robot, in the map frame."""
-    if not frame.is_shifted:
+    if not origin.any():
         return result
-    by = Shift.of(frame, result.map)
     parts = ("snapshots", "estimate", "maps", "objects", "traffic", "changes", "doors")
-    moved = {name: shift(getattr(result, name), by) for name in parts}
-    return dataclasses.replace(result, **moved, frame=frame, local=result)
+    fields = {**FIELDS, MappingResult: dict.fromkeys(parts, "part")}
+    moved = shift(result, to_map_frame(origin, result.map), fields)
+    return dataclasses.replace(moved, origin=origin, local=result)

@@ -6,7 +6,7 @@ ends in them is probably dynamic. The tilting laser's own occupancy evidence mul
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class TiltingResult(ShortRepr):
         boxes: around the objects that the planar laser tracked.
         boxes_hit: number of boxes that hold beams.
         learned: what the occupancy evidence learned, JSON-able; empty without.
+        local: the same in a frame near the robot, as of `MappingResult`.
     """
 
     recording: Recording
@@ -62,6 +63,12 @@ class TiltingResult(ShortRepr):
     boxes: list[Box]
     boxes_hit: int
     learned: dict[str, Any]
+    local: "TiltingResult | None" = field(default=None, repr=False)
+
+    @property
+    def near(self) -> "TiltingResult":
+        """The same in a frame near the robot, where coordinates of 32 bits are precise."""
+        return self if self.local is None else self.local
 
 
 @dataclass(frozen=True, eq=False)

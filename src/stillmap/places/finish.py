@@ -2,7 +2,7 @@
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,18 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import package_version, write_text
 from stillmap.core.input_files import read_bytes
 from stillmap.core.json import write_json
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.local_frame import Fields, Shift, shift, shift_poses
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.io.trajectory import MAX_BYTES, write_tum
+from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
 from stillmap.places.changes import PlaceChange, detect_place_changes
 from stillmap.places.grow import estimate_planar
 from stillmap.places.keyframes import join_keyframes
 from stillmap.places.objects import write_objects
-from stillmap.places.place import Place, PlacedSession, join_constraints
+from stillmap.places.place import Place, PlacedSession, fit_alignment, join_constraints
 from stillmap.places.place_map import (
     ShownState,
     changed_cell_table,
@@ -55,6 +56,8 @@ from stillmap.slam import PoseGraph
 LAST, MAJORITY = "last", "majority"
 _STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
 _DAY_NS = 86_400 * 10**9
+# fields that depend on the frame
+_FIELDS: Fields = {PlaceChange: dict.fromkeys(("low", "high", "from_low", "from_high"), "points")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,24 +163,25 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         options: of mapping, and of the map.
         map_state: see `MergeJob`.
     """
-    place, frame = result.place, result.place.local_frame
+    place, by = result.place, _to_map_frame(result.place)
     for time, k in enumerate(place.in_time()):
         _write_session(folder, result, place.sessions[k], time)
     _write_place_files(folder, result)
-    write_objects(folder, place)
+    transforms = {placed.session.name: _between_maps(placed, by) for placed in place.sessions}
+    write_objects(folder, transforms)
     joined = join_keyframes([placed.session.keyframes for placed in place.sessions]).recording
     poses = np.concatenate([placed.keyframe_poses for placed in place.sessions])
     if place.dimension == 3:
         labels = np.concatenate(
             [_label_keyframes(placed, result.shown) for placed in place.sessions]
         )
-        write_clouds(folder, joined, frame.to_map(poses), labels, origin=frame.origin)
+        write_clouds(folder, joined, shift_poses(poses, by.metres), labels, origin=by.metres)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)
     # labels are not rated: keyframes are too far apart for that
     record["quality"] = quality_record(rate_geometry(joined, poses, occupancy))
-    occupancy = replace(occupancy, origin=frame.corner_to_map(occupancy.origin))
+    occupancy = shift(occupancy, by, FIELDS)
     write_map_server(folder, occupancy, options.output.map_mode)
     write_map_npz(folder / "map.npz", occupancy)
     page = render_place_report(folder, occupancy, options.output.map_mode, record)
@@ -190,7 +194,7 @@ def place_record(
 ) -> dict[str, Any]:
     """The content of `run.json` of a place; `occupancy` is its map in its local frame."""
     place, labels = result.place, read_labels(folder)
-    origin = place.local_frame.origin
+    origin = place.home.origin
     known = int(np.count_nonzero(~np.isnan(np.asarray(occupancy.p_occupied))))
     return {
         "format_version": FORMAT_VERSION,
@@ -225,14 +229,33 @@ def place_record(
 def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, time: int) -> None:
     """Write what differs from merge to merge into `sessions/NAME/`; `time` is its index there."""
     place, home = result.place, folder / "sessions" / placed.session.name
-    write_tum(
-        home / "trajectory.tum", placed.session.stamp_ns, place.local_frame.to_map(placed.poses)
-    )
+    poses = shift_poses(placed.poses, place.home.origin)
+    write_tum(home / "trajectory.tum", placed.session.stamp_ns, poses)
     n_beams = int(np.load(home / "beams" / "offset.npy", mmap_mode="r")[-1])
     beams = read_beam_cells(home, n_beams, place.voxel_size)
     centres = beams.place_centres(placed.session.node_poses, placed.nodes)
     write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
     write_placement(home, placed)
+
+
+def _to_map_frame(place: Place) -> Shift:
+    """From the frame of the place to the map frame of the result of the session that has it."""
+    return Shift.of(place.home.origin, place.resolution)
+
+
+def _between_maps(placed: PlacedSession, by: Shift, T: Float | None = None) -> Float:
+    """(D+1, D+1) of a session, from the map frame of its result to that of the place.
+
+    Args:
+        placed: the session.
+        by: as of `_to_map_frame`.
+        T: T_place_session, in the frames that it was placed in; None: fitted to all nodes.
+    """
+    if T is None:
+        T = fit_alignment(placed.session.node_poses, placed.nodes)
+    if placed.session.origin.any():
+        T = T @ shift_poses(np.eye(len(T)), -placed.session.origin)
+    return shift_poses(T, by.metres)
 
 
 def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
@@ -249,18 +272,20 @@ def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
 
 def _write_place_files(folder: Path, result: PlaceResult) -> None:
     """Write the files of the place as a whole, but the map, the report and `run.json`."""
-    place, frame, names = result.place, result.place.local_frame, result.names_in_time
+    place, by, names = result.place, _to_map_frame(result.place), result.names_in_time
     homes = [folder / "sessions" / placed.session.name for placed in place.sessions]
-    poses = frame.to_map(np.concatenate([placed.poses for placed in place.sessions]))
+    poses = shift_poses(np.concatenate([placed.poses for placed in place.sessions]), by.metres)
     with (folder / "trajectory.tum").open("wb") as file:
         for home in homes:
             file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
     write_joined_beams(folder / "beams", homes)
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))
-    write_json(folder / CHANGES, _change_records(result.changes, names, frame))
-    write_npz(folder / "changes.npz", _change_cells(result.changes, result.shown.place, frame))
-    write_npz(folder / STATES, changed_cell_table(result.planar, names, frame))
+    write_json(folder / CHANGES, _change_records(shift(result.changes, by, _FIELDS), names))
+    write_npz(folder / "changes.npz", _change_cells(result.changes, result.shown.place, by))
+    states = changed_cell_table(result.planar, names)
+    states["cells"] = (states["cells"] + by.cells[:2]).astype(np.int32)
+    write_npz(folder / STATES, states)
     write_ties(folder / TIES, place.ties, place.dimension)
 
 
@@ -285,7 +310,7 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     counts = [len(placed_session.session.stamp_ns) for placed_session in result.place.sessions]
     first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
     return [
-        _placed_record(placed[name], first_scan[name], result.place.local_frame)
+        _placed_record(placed[name], first_scan[name], _to_map_frame(result.place))
         if name in placed
         else {
             "name": name,
@@ -298,14 +323,14 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     ]
 
 
-def _placed_record(placed: PlacedSession, first_scan: int, frame: LocalFrame) -> dict[str, Any]:
+def _placed_record(placed: PlacedSession, first_scan: int, by: Shift) -> dict[str, Any]:
     """The entry of a session whose scans begin at `first_scan` of those of the place."""
     stamp_ns = placed.session.stamp_ns
     return {
         "name": placed.session.name,
         "input": placed.session.input,
         "accepted": True,
-        "T_place_session": placed.between_maps(placed.T, frame).tolist(),
+        "T_place_session": _between_maps(placed, by, placed.T).tolist(),
         "covariance": placed.covariance.tolist(),
         "overlap": round(placed.overlap, 4),
         "first_stamp_ns": int(stamp_ns[0]),
@@ -316,39 +341,37 @@ def _placed_record(placed: PlacedSession, first_scan: int, frame: LocalFrame) ->
 
 
 def _change_records(
-    changes: Sequence[PlaceChange], names: Sequence[str], frame: LocalFrame
+    changes: Sequence[PlaceChange], names: Sequence[str]
 ) -> list[dict[str, object]]:
     """The entries of `changes.json`.
 
     Args:
-        changes: in the order of time.
+        changes: in the order of time, in the map frame.
         names: of the sessions, in the order of time.
-        frame: of the changes, in the map frame.
     """
     out = []
     for number, change in enumerate(changes):
         record: dict[str, object] = {
             "id": number,
             "kind": change.kind,
-            "box": _corners(change.low, change.high, frame),
+            "box": _corners(change.low, change.high),
         }
         if change.from_low is not None and change.from_high is not None:
-            record["from_box"] = _corners(change.from_low, change.from_high, frame)
+            record["from_box"] = _corners(change.from_low, change.from_high)
         record["between"] = [names[change.before], names[change.after]]
         record["probability"] = round(change.probability, 4)
         out.append(record)
     return out
 
 
-def _corners(low: Float, high: Float, frame: LocalFrame) -> list[float]:
-    """x0, y0, x1, y1, and in 3D z0, z1, in the map frame."""
-    low, high = frame.points_to_map(low), frame.points_to_map(high)
+def _corners(low: Float, high: Float) -> list[float]:
+    """x0, y0, x1, y1, and in 3D z0, z1."""
     plane = [*low[:2], *high[:2]]
     return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]
 
 
 def _change_cells(
-    changes: Sequence[PlaceChange], place: PlaceStates, frame: LocalFrame
+    changes: Sequence[PlaceChange], place: PlaceStates, by: Shift
 ) -> dict[str, NDArray[np.generic]]:
     """The cells of all changes: `change` (K,) the entry of `changes.json`, and `xy` (K, 2) or `xyz`
     (K, 3), the centres of the cells in metres."""
@@ -356,5 +379,5 @@ def _change_cells(
     number = np.repeat(np.arange(len(changes), dtype=np.int32), [len(of) for of in cells])
     of = np.concatenate([np.zeros(0, np.intp), *cells])
     D = place.cells.shape[1]
-    centres = frame.points_to_map((place.cells[of] + 0.5) * place.resolution)
+    centres = (place.cells[of] + 0.5) * place.resolution + by.metres[:D]
     return {"change": number, "xyz"[:D]: centres}

@@ -17,7 +17,6 @@ from stillmap.core.array_folder import write_arrays
 from stillmap.core.array_types import Float, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.json import write_json
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress
 from stillmap.core.recording import Recording
@@ -28,10 +27,10 @@ from stillmap.pipeline.options import Options
 from stillmap.places.evidence import find_beam_cells
 from stillmap.places.keyframes import Keyframes, Session, select_keyframes
 from stillmap.places.objects import copy_objects
-from stillmap.places.store import MAX_DISTANCE, SESSION_ORIGIN, STATE, read_session, write_session
+from stillmap.places.store import SESSION_ORIGIN, STATE, read_session, write_session
 from stillmap.results.folder import open_result
 from stillmap.results.mapped_place import input_stem
-from stillmap.results.pose_graph_g2o import read_g2o
+from stillmap.results.near_result import NearResult
 from stillmap.results.reader import LOCAL_ORIGIN, RECORD, TILTING, is_place, is_result, read_run
 from stillmap.results.result import Result, build, load
 from stillmap.slam import PoseGraph, deskew_recording, local_map
@@ -242,19 +241,12 @@ def to_session(name: str, result: Result, deskewed: Recording, threads: int) -> 
         InputError: its record or pose graph is damaged.
     """
     assert result.path is not None
-    frame, output = result.loaded.read_frame(), result.options.output
-    frame = frame if frame.is_shifted else LocalFrame.near(result.poses)
-    poses, graph = frame.to_local(result.poses), None
-    if not (np.abs(poses) < MAX_DISTANCE).all():
-        where = str(result.path / RECORD)
-        raise InputError("local_origin is far from its trajectory", where=where)
-    if (result.path / "graph.g2o").is_file():
-        graph = read_g2o(result.path / "graph.g2o")
-        graph = dataclasses.replace(graph, poses=frame.to_local(graph.poses))
+    near, output = NearResult.find(result.path, result.poses), result.options.output
+    poses, graph = near.take(result.poses), near.read_graph()
     band = (output.min_obstacle_height, output.max_obstacle_height)
     p_static = np.asarray(result.p_static)
     session = make_session(name, deskewed, poses, p_static, graph, band, threads)
-    return dataclasses.replace(session, frame=frame)
+    return dataclasses.replace(session, origin=near.origin)
 
 
 def make_session(
@@ -317,8 +309,8 @@ def _copy_record(result: Path, folder: Path, session: Session) -> None:
     """Copy what describes how a session was read and mapped."""
     record = {**read_run(result), "dimension": session.dimension}
     record.pop(LOCAL_ORIGIN, None)  # what is written of a session is in the frame of its place
-    if session.frame.is_shifted:
-        record[SESSION_ORIGIN] = session.frame.origin.tolist()
+    if session.origin.any():
+        record[SESSION_ORIGIN] = session.origin.tolist()
     write_json(folder / RECORD, record, indent=2)
 
 

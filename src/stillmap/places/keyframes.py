@@ -7,7 +7,6 @@ import numpy as np
 
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float, Float32, Index, Int64
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.slam import PoseGraph
@@ -58,7 +57,7 @@ class Session(ShortRepr):
         keyframes: scans in D dimensions, spaced by travel.
         planar: the same scans in the plane; in 2D the keyframes themselves.
         clearance: (K,) height of the base of each keyframe above the ground, metres; 0 in 2D.
-        frame: the session's frame, in the map frame of the result that it was made from.
+        origin: (3,) m, of the session's frame, in the map frame of the result that it is from.
     """
 
     name: str
@@ -69,7 +68,7 @@ class Session(ShortRepr):
     keyframes: Keyframes
     planar: Keyframes
     clearance: Float
-    frame: LocalFrame = field(default_factory=LocalFrame)
+    origin: Float = field(default_factory=lambda: np.zeros(3))
 
     @property
     def dimension(self) -> int:

@@ -1,7 +1,7 @@
 """Moving objects of sessions in the frame of their place."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,6 @@ from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content, read_bytes
 from stillmap.core.json import read_json
-from stillmap.core.local_frame import LocalFrame
-from stillmap.places.place import Place, PlacedSession, fit_alignment
 from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_traffic
 from stillmap.results.point_cloud import coordinate_fields, ply_header
 from stillmap.results.reader import read_tracks
@@ -39,20 +37,21 @@ def copy_objects(result: Path, state: Path) -> None:
             copy_content(path, target / path.name)
 
 
-def write_objects(folder: Path, place: Place) -> None:
+def write_objects(folder: Path, transforms: Mapping[str, Float]) -> None:
     """Write `objects/` of each session in the frame of the place, and of the place those of all,
     numbered anew, with its `traffic.npz`.
 
     Args:
-        folder: of the place, with the objects in the session's frame in the state of each.
-        place: the place.
+        folder: of the place, with the objects in the state of each session.
+        transforms: (D+1, D+1) of each session by its name, to the map frame of the place from that
+            of the session's result.
     """
     joined = folder / _OBJECTS
     joined.mkdir()
     records = list[dict[str, Any]]()
-    for placed in place.sessions:
-        home = folder / "sessions" / placed.session.name
-        of_session, clouds = _place_objects(home, placed, place.local_frame)
+    for name, T in transforms.items():
+        home = folder / "sessions" / name
+        of_session, clouds = _place_objects(home, T)
         for record in of_session:
             number = len(records)
             if cloud := clouds.get(f"{record['id']:04d}.ply"):
@@ -62,16 +61,12 @@ def write_objects(folder: Path, place: Place) -> None:
     write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(joined / _LIST)))
 
 
-def _place_objects(
-    home: Path, placed: PlacedSession, frame: LocalFrame
-) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+def _place_objects(home: Path, T: Float) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
     """Write the objects of a session; returns their records, and their clouds by name."""
     source, target = home / "state" / _ORIGINAL, home / _OBJECTS
     if not source.is_dir():
         return [], {}
     target.mkdir()
-    # objects are kept in the map frame of the result
-    T = placed.between_maps(fit_alignment(placed.session.node_poses, placed.nodes), frame)
     records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
     _write_records(target / _LIST, records)
     clouds = {path.name: _transform_cloud(path, T) for path in sorted(source.glob("*.ply"))}

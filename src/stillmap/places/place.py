@@ -8,7 +8,6 @@ import numpy as np
 
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Bool, Float
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.evidence import Evidence, measure_evidence
 from stillmap.places.keyframes import Session
@@ -147,14 +146,6 @@ class PlacedSession(ShortRepr):
         """(D+1, D+1) T_place_session, where the first scan is."""
         return np.asarray(self.nodes[0] @ se2.inverse(self.session.node_poses[0]))
 
-    def between_maps(self, T: Float, frame: LocalFrame) -> Float:
-        """A transform (D+1, D+1) from the session's frame to that of the place, from the map frame
-        of the session's result to that of the place; `frame` is the place's in its map frame."""
-        own = self.session.frame
-        if not own.is_shifted and not frame.is_shifted:
-            return T
-        return frame.to_map(np.asarray(T @ own.to_local(np.eye(len(T)))))
-
     @cached_property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_place_base of all scans."""
@@ -208,12 +199,10 @@ class Place(ShortRepr):
     frame: str | None = None
 
     @property
-    def local_frame(self) -> LocalFrame:
-        """Its frame, in the map frame of the result of the session that has its frame."""
+    def home(self) -> Session:
+        """The session that has its frame."""
         named = self.frame or self.sessions[0].session.name
-        return next(
-            placed.session.frame for placed in self.sessions if placed.session.name == named
-        )
+        return next(placed.session for placed in self.sessions if placed.session.name == named)
 
     @property
     def dimension(self) -> int:

@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32, Index
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import bound_box
 from stillmap.core.tiles import TILE, TiledArray, compact, crop
@@ -134,21 +133,17 @@ def label_session(shown: ShownState, beams: BeamCells, centres: Float, session: 
     return out
 
 
-def changed_cell_table(
-    shown: ShownState, names: Sequence[str], frame: LocalFrame
-) -> dict[str, NDArray[np.generic]]:
+def changed_cell_table(shown: ShownState, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The changed cells in the plane and their states in every session, for report and viewer.
 
     Args:
         shown: the state of the place in the plane.
         names: of the sessions, in the order of time.
-        frame: of the place, in its map frame.
     """
-    by = np.round(frame.origin[:2] / shown.place.resolution).astype(np.int64)
     states = shown.place.states
     changed = np.setdiff1d(np.flatnonzero(states.p_changing > 0.5), shown.noise)
     return {
-        "cells": (shown.place.cells[changed] + by).astype(np.int32),
+        "cells": shown.place.cells[changed].astype(np.int32),
         "occupied": states.path[changed],
         "observed": states.observed[changed],
         "shown": shown.p_shown[changed] > 0.5,

@@ -26,6 +26,7 @@ from stillmap.places.evidence import BLOCK, BeamCells, Evidence
 from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.place import Place, PlacedSession, Tie
 from stillmap.results.folder import ResultFolder
+from stillmap.results.near_result import MAX_DISTANCE
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 from stillmap.results.reader import RECORD, SESSIONS, read_labels, read_run, read_tracks
 from stillmap.results.timeline import HINT, PlaceSession, read_sessions
@@ -33,7 +34,6 @@ from stillmap.results.timeline import HINT, PlaceSession, read_sessions
 STATE, TIES = "state", "ties.npz"
 # in the record of a session: of the frame that a place has it in, in the map frame of its result
 SESSION_ORIGIN = "session_origin"
-MAX_DISTANCE = 1e6  # m, of poses from the origin of their session: no place is larger
 _BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
 _MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
@@ -216,8 +216,8 @@ def read_session(home: Path, path: str | None, stamp_ns: Int64) -> Session:
         or not (np.abs(clearance) < MAX_DISTANCE).all()
     ):
         raise _inconsistent(state)
-    frame = ResultFolder(home, read_run(home)).read_frame(SESSION_ORIGIN)
-    return Session(home.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, frame)
+    origin = ResultFolder(home, read_run(home)).read_origin(SESSION_ORIGIN)
+    return Session(home.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, origin)
 
 
 def _read_keyframes(folder: Path) -> Keyframes:

@@ -13,7 +13,6 @@ from stillmap.core import arrays, config
 from stillmap.core.array_folder import parse
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import Region
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
@@ -93,19 +92,19 @@ class ResultFolder(ShortRepr):
             raise InputError("names no options", where=str(self.path))
         return self._resolve({"read": noted["read"]}).read
 
-    def read_frame(self, name: str = LOCAL_ORIGIN) -> LocalFrame:
-        """The frame whose origin (3,) is an entry of the record, in which it was computed unless
-        another one is named; without the entry the map frame.
+    def read_origin(self, name: str = LOCAL_ORIGIN) -> NDArray[np.float64]:
+        """(3,) m, an entry of the record: by default the origin of the frame in which it was
+        computed; zero without the entry.
 
         Raises:
             InputError: it is no place.
         """
         if self.record.get(name) is None:
-            return LocalFrame()
+            return np.zeros(3)
         origin = parse(self.record[name], tuple[float, float, float], self.path)
         if not (np.abs(origin) < MAX_TRANSLATION).all():
             raise InputError(f"{name} is no place", where=str(self.path))
-        return LocalFrame(np.array(origin))
+        return np.array(origin)
 
     @property
     def dimension(self) -> int:

@@ -10,18 +10,17 @@ import numpy as np
 
 from stillmap.core.arrays import write_npz
 from stillmap.core.grid_map import is_inside, shift_region
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.local_frame import Fields, Shift, shift
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.em import estimate_ground
 from stillmap.mesh import build
-from stillmap.mesh.build import Models
+from stillmap.mesh.build import Models, ObjectModel
 from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
 from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.views import View
-from stillmap.pipeline.map_frame import Shift, shift
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.gltf import write_glb
@@ -30,6 +29,15 @@ if TYPE_CHECKING:
     from stillmap.results.mapped_place import MappedPlace
 
 _MICROMETRES = 6  # digits
+# fields that depend on the frame; views of moving objects and their surfaces are in that of each
+_FIELDS: Fields = {
+    Models: {"assignment": "part", "textured": "part", "views": "part", "objects": "part"},
+    ViewAssignment: {"mesh": "part"},
+    TexturedMesh: {"vertices": "points"},
+    Mesh: {"vertices": "points"},
+    View: {"T_camera_map": "view"},
+    ObjectModel: {"T_map_object": "poses"},
+}
 
 
 @limit_blas_threads()
@@ -42,8 +50,8 @@ def build_models(
 ) -> Models:
     """Builds the textured surface and the object models; `result.save(models=...)` writes them.
 
-    They are in the frame of `result.frame`, whose origin `Models.origin` is: zero unless the map
-    frame is far away.
+    They are in the frame in which the result was computed, whose origin is `Models.origin`: zero
+    unless the map frame is far away.
 
     Args:
         result: of a 3D recording, or of the flat laser of a rig; `result.options.mesh` applies.
@@ -62,13 +70,13 @@ def build_models(
     mapped = result if isinstance(result, MappingResult) else result.mapping
     if mapped is None:
         raise ValueError("result: expected one that was just built")
-    start_ns, origin = int(mapped.recording.stamp_ns[0]), mapped.frame.origin
+    start_ns, origin = int(mapped.recording.stamp_ns[0]), mapped.origin
     seen: MappingResult | TiltingResult
     if tilting is None:
         seen = mapped.near
         boxes = box_objects(seen.objects, start_ns)
     else:  # the flat laser gives the tracks, the tilting laser the 3D data
-        seen = shift(tilting, Shift(-origin))
+        seen = tilting.near
         ground = estimate_ground(seen.deskewed, seen.poses, seen.p_static, threads)
         boxes = extrude_boxes(seen.boxes, seen.objects, ground)
     objects, region = seen.objects, result.options.output.region
@@ -91,13 +99,11 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
         n_images: of the recording.
         quality: JPEG quality of texture pages; 0: PNG.
     """
-    frame = LocalFrame(models.origin)
+    models = shift(models, Shift(models.origin), _FIELDS)
     if len(models.textured):
-        place = models.textured
-        place = dataclasses.replace(place, vertices=frame.points_to_map(place.vertices))
-        write_glb(folder / "mesh.glb", _drop_empty_texture(place), quality)
+        write_glb(folder / "mesh.glb", _drop_empty_texture(models.textured), quality)
         path = folder / "mesh_faces.npz"
-        write_faces(path, models.assignment, models.views, n_images, "map", frame)
+        write_faces(path, models.assignment, models.views, n_images, "map")
     objects = folder / "objects"
     if models.objects:
         objects.mkdir(exist_ok=True)
@@ -110,7 +116,7 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
             "stamp_ns": one.stamp_ns,
             "first_stamp_ns": one.span_ns[0],
             "last_stamp_ns": one.span_ns[1],
-            "T_map_object": np.round(frame.to_map(one.T_map_object), _MICROMETRES).tolist(),
+            "T_map_object": np.round(one.T_map_object, _MICROMETRES).tolist(),
             "rigid": one.shape.rigid,
         }
         text = json.dumps(record, allow_nan=False)
@@ -123,12 +129,7 @@ def _drop_empty_texture(model: TexturedMesh) -> TexturedMesh | Mesh:
 
 
 def write_faces(
-    path: Path,
-    assignment: ViewAssignment,
-    views: Sequence[View],
-    n_images: int,
-    name: str,
-    frame: LocalFrame | None = None,
+    path: Path, assignment: ViewAssignment, views: Sequence[View], n_images: int, name: str
 ) -> None:
     """Writes which image textures each face; `name` of the frame that they are written in.
 
@@ -136,16 +137,13 @@ def write_faces(
     (F,), and `T_camera_map` or `T_camera_object` (N, 4, 4) of all images, NaN where not used.
     """
     number = np.array([view.image for view in views] + [-1], np.int32)
-    frame = frame or LocalFrame()
     poses = np.full((n_images, 4, 4), np.nan)
-    T_local_map = frame.to_local(np.eye(4))
     for view in views:
-        T = view.T_camera_map
-        poses[view.image] = T @ T_local_map if frame.is_shifted else T
+        poses[view.image] = view.T_camera_map
     write_npz(
         path,
         {
-            "vertices": frame.points_to_map(assignment.mesh.vertices),
+            "vertices": np.asarray(assignment.mesh.vertices, np.float64),
             "faces": assignment.mesh.faces,
             "image": number[assignment.view],
             "p_static": assignment.p_static,

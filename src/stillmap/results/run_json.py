@@ -58,7 +58,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "warnings": list(result.warnings),
         "quality": quality_record(result.quality),
         "learned": result.learned,
-        **({LOCAL_ORIGIN: result.frame.origin.tolist()} if result.frame.is_shifted else {}),
+        **({LOCAL_ORIGIN: result.origin.tolist()} if result.origin.any() else {}),
         "calibration": _calibration(result.calibration),
         "doubts": _doubts(result),
         "changes": [_change(one) for one in result.changes],

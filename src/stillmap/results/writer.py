@@ -74,7 +74,7 @@ def save(
         for one in (result if is_3d else None, tilting):
             if one is not None:
                 seen = limit_hits(one.deskewed, one.poses, region)
-                write_clouds(folder, seen, one.poses, one.p_static, colors, result.frame.origin)
+                write_clouds(folder, seen, one.poses, one.p_static, colors, result.origin)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.grid_map import limit_hits
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.local_frame import find_origin, shift_poses
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.ros import writer as ros
@@ -83,12 +83,12 @@ def write(
     encoder = LaserScanEncoder(recording) if recording.dimension == 2 else None
     seen = recording if recording.dimension == 2 else result.deskewed
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        near = LocalFrame.near(result.poses)  # sessions of a place state no frame of their own
-        more = [(MAP, _LOCAL, near.to_map(np.eye(4)))] if near.is_shifted else []
+        origin = find_origin(result.poses)  # sessions of a place state none of their own
+        more = [(MAP, _LOCAL, shift_poses(np.eye(4), origin))] if origin.any() else []
         frames = write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
         if encoder is None:
-            _write_static_points(bag, result, seen, near)
+            _write_static_points(bag, result, seen, origin)
             write_scan = _make_sweep_writer(bag, result, seen, frames)
         else:
             write_scan = _make_scan_writer(bag, result, encoder, frames)
@@ -117,7 +117,7 @@ def _write_latched_topics(bag: BagWriter, result: MappedPlace) -> None:
 
 
 def _write_static_points(
-    bag: BagWriter, result: MappedPlace, deskewed: Recording, near: LocalFrame
+    bag: BagWriter, result: MappedPlace, deskewed: Recording, origin: Float
 ) -> None:
     """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
     programs expect coordinates of 32 bits."""
@@ -128,8 +128,8 @@ def _write_static_points(
     first = int(result.recording.stamp_ns[0])
     send = bag.add_topic("/static_points", POINT_CLOUD, latched=True)
     block = cloud.sample(_MAX_POINTS)
-    block = block._replace(points=near.points_to_local(block.points))
-    send(first, _make_cloud(first, _LOCAL if near.is_shifted else MAP, block))
+    block = block._replace(points=block.points - origin)
+    send(first, _make_cloud(first, _LOCAL if origin.any() else MAP, block))
 
 
 def _make_cloud(stamp_ns: int, frame: str, block: Block) -> Fields:

@@ -43,10 +43,10 @@ def points_data(
 
     Where there is a ceiling, it is left out. None without points in 3D.
     """
-    seen = result if tilting is None else tilting
+    seen = (result if tilting is None else tilting).near
     if seen.recording.dimension == 2:
         return None
-    deskewed, poses = seen.deskewed, result.frame.to_local(seen.poses)
+    deskewed, poses = seen.deskewed, seen.poses
     samples = (
         sample_points(deskewed, poses, seen.p_static, _MAX_STATIC, dynamic=False),
         sample_points(deskewed, poses, seen.p_static, _MAX_DYNAMIC),
@@ -58,7 +58,7 @@ def points_data(
         return None
     heights_shown = np.quantile(static[:, 2], [_OUTLIERS, 1.0 - _OUTLIERS]).round(1) + 0.0
     low, high = heights_shown.tolist()
-    above = float(result.frame.origin[2])
+    above = float(result.origin[2])
     heights = color_by_height(static[:, 2], low, high)
     orange = np.broadcast_to(np.array(ORANGE, np.uint8), (len(dynamic), 3))
     T = _choose_view(static)
