@@ -10,7 +10,7 @@ from stillmap import places
 from stillmap.core import se2
 from stillmap.places.evidence import measure_evidence
 from stillmap.places.grow import add_session, start_place
-from stillmap.places.inputs import make_session
+from stillmap.places.keyframes import Session, chain_poses, select_keyframes
 from stillmap.places.surface_map import compare_maps, is_determined, make_surface_map
 
 # corners of rooms, in order; metres
@@ -41,6 +41,13 @@ def scan(corners, poses, n_beams=180, max_range=25.0):
     return of_one_sensor(np.arange(T) * 1_000_000_000, np.arange(T + 1) * n_beams, points, hit)
 
 
+def make_session(name, recording, poses, p_static):
+    graph = chain_poses(poses)
+    keyframes = select_keyframes(recording, poses, p_static, graph.keyframes)
+    known = (name, None, recording.stamp_ns, poses, graph, keyframes)
+    return Session.of(*known, (0.2, 1.8), np.zeros(3))
+
+
 def session(name, corners, way, n=40):
     """A session that drove along a way through a room, in the frame of its own first pose."""
     way = np.array(way, float)
@@ -51,7 +58,7 @@ def session(name, corners, way, n=40):
     recording = scan(corners, world)
     poses = se2.inverse(world[0]) @ world
     p_static = np.where(recording.hit, np.float32(1.0), np.float32(np.nan))
-    return make_session(name, recording, poses, p_static, None, (0.2, 1.8)), world[0]
+    return make_session(name, recording, poses, p_static), world[0]
 
 
 def grow(first, second):
@@ -93,7 +100,7 @@ def test_a_session_without_a_return_is_refused(empty_first):
     nothing = np.full_like(seen.points, np.nan)
     blind = replace(seen, points=nothing, hit=np.zeros_like(seen.hit))
     unknown = np.full(len(nothing), np.nan, np.float32)
-    empty = make_session("empty", blind, poses, unknown, None, (0.2, 1.8))
+    empty = make_session("empty", blind, poses, unknown)
     growth = grow(*((empty, full) if empty_first else (full, empty)))
     assert growth.refused == "no part of it looks like the place"
 

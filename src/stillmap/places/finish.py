@@ -231,8 +231,7 @@ def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, tim
     place, home = result.place, folder / "sessions" / placed.session.name
     poses = shift_poses(placed.poses, place.home.origin)
     write_tum(home / "trajectory.tum", placed.session.stamp_ns, poses)
-    n_beams = int(np.load(home / "beams" / "offset.npy", mmap_mode="r")[-1])
-    beams = read_beam_cells(home, n_beams, place.voxel_size)
+    beams = read_beam_cells(home, placed.session, place.voxel_size)
     centres = beams.place_centres(placed.session.node_poses, placed.nodes)
     write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
     write_placement(home, placed)

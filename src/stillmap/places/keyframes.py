@@ -1,19 +1,29 @@
 """A session as a place keeps it: its keyframes, poses and pose graph."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate
+from typing import Any
 
 import numpy as np
 
+from stillmap import em
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.slam import PoseGraph
+from stillmap.mapping.projection import project_to_plane
+from stillmap.slam import PoseGraph, local_map
+from stillmap.slam.local_map import KEYFRAME_ANGLE
+from stillmap.slam.pose_graph import Constraint
 from stillmap.slam.scan_hits import beams_of_scans, select_beams
 
 # between keyframes: m of travel, rad, s of standing still; in 3D sweeps see farther
 _SPACING = {2: (0.25, 0.2, 4.0), 3: (1.0, 0.5, 4.0)}
+_NODE_DISTANCE = {2: 1.0, 3: 2.0}  # m between the nodes of a session without a pose graph
+# of a step between them: m and rad, at least, and per root of a metre
+_STEP_STD, _MIN_STEP = (0.01, 0.002), 0.05
+_PLANAR_CELL = 0.1  # m, in which one planar hit per direction is kept
 _MAX_BEAMS = 24_000  # of a keyframe: denser sweeps are thinned evenly, which registration allows
 
 
@@ -68,7 +78,27 @@ class Session(ShortRepr):
     keyframes: Keyframes
     planar: Keyframes
     clearance: Float
-    origin: Float = field(default_factory=lambda: np.zeros(3))
+    origin: Float
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        input: str | None,
+        stamp_ns: Int64,
+        poses: Float,
+        graph: PoseGraph,
+        keyframes: Keyframes,
+        band: tuple[float, float],
+        origin: Float,
+        threads: int = 1,
+    ) -> "Session":
+        """A session with its keyframes in the plane; `band`: m above the ground, lowest and
+        greatest height of obstacles."""
+        planar, clearance = keyframes, np.zeros(len(keyframes))
+        if keyframes.dimension == 3:
+            planar, clearance = _project(keyframes, band, threads)
+        return cls(name, input, stamp_ns, poses, graph, keyframes, planar, clearance, origin)
 
     @property
     def dimension(self) -> int:
@@ -79,6 +109,34 @@ class Session(ShortRepr):
     def node_poses(self) -> Float:
         """(N, D+1, D+1) T_session_base of the nodes of the pose graph."""
         return self.poses[self.graph.keyframes]
+
+
+def _project(
+    keyframes: Keyframes, band: tuple[float, float], threads: int
+) -> tuple[Keyframes, Float]:
+    """Keyframes of a 3D session in the plane, and the clearance (K,) of each above the ground."""
+    recording, poses = keyframes.recording, keyframes.poses
+    ground = em.estimate_ground(recording, poses, keyframes.e, threads)
+    plan = project_to_plane(recording, poses, ground, band, _PLANAR_CELL, False, threads)
+    e = keyframes.e[plan.beam]
+    planar = Keyframes(plan.recording, keyframes.scans, plan.poses, e, keyframes.nodes)
+    xy = np.ascontiguousarray(poses[:, :2, 3])
+    return planar, poses[:, 2, 3] - ground.height_at(xy)
+
+
+def chain_poses(poses: Float) -> PoseGraph:
+    """A pose graph of poses (T, D+1, D+1) that no graph came with: steps between keyframes."""
+    D = poses.shape[-1] - 1
+    nodes = local_map.select_keyframes(poses, _NODE_DISTANCE[D], KEYFRAME_ANGLE)
+    steps = se2.inverse(poses[nodes[:-1]]) @ poses[nodes[1:]]
+    metres = np.linalg.norm(steps[:, :D, D], axis=1) + _MIN_STEP
+    turns = D * (D - 1) // 2
+    unit = np.diag(np.square([_STEP_STD[0]] * D + [_STEP_STD[1]] * turns))
+    chain = [
+        Constraint(k, k + 1, T, length * unit)
+        for k, (T, length) in enumerate(zip(steps, metres.tolist(), strict=True))
+    ]
+    return PoseGraph(nodes, poses[nodes], chain)
 
 
 def select_keyframes(
@@ -130,27 +188,23 @@ def join_keyframes(sessions: Sequence[Keyframes]) -> Keyframes:
     """The keyframes of some sessions, one or more, as those of one; poses are still each in its own
     frame."""
     recordings = [part.recording for part in sessions]
-    beams = np.cumsum([0, *(part.n_beams for part in recordings)])
-    sensors = np.cumsum([0, *(len(part.T_base_sensor) for part in recordings)])
-    keyframes = np.cumsum([0, *(len(part) for part in sessions)])
-    ends = [part.offset[1:] + first for part, first in zip(recordings, beams, strict=False)]
+
+    def join(name: str, parts: Sequence[Any], firsts: Sequence[int] | None = None) -> Any:
+        arrays = [getattr(part, name) for part in parts]
+        if firsts is not None:  # numbers, which go on from one part to the next
+            arrays = [array + first for array, first in zip(arrays, firsts, strict=True)]
+        return np.concatenate(arrays)
+
+    def begins(counts: Iterable[int]) -> list[int]:
+        return [0, *accumulate(counts)][: len(sessions)]
+
+    sensors = join("sensor", recordings, begins(len(part.T_base_sensor) for part in recordings))
+    counts = np.concatenate([np.diff(part.offset) for part in recordings])
     recording = replace(
         recordings[0],
-        stamp_ns=np.concatenate([part.stamp_ns for part in recordings]),
-        offset=np.concatenate([np.zeros(1, np.int64), *ends]),
-        points=np.concatenate([part.points for part in recordings]),
-        hit=np.concatenate([part.hit for part in recordings]),
-        T_base_sensor=np.concatenate([part.T_base_sensor for part in recordings]),
-        sensor=np.concatenate(
-            [part.sensor + first for part, first in zip(recordings, sensors, strict=False)],
-            dtype=np.int32,
-            casting="same_kind",
-        ),
+        **{name: join(name, recordings) for name in ("stamp_ns", "points", "hit", "T_base_sensor")},
+        offset=np.concatenate([np.zeros(1, np.int64), counts.cumsum()]),
+        sensor=sensors.astype(np.int32),
     )
-    return Keyframes(
-        recording,
-        np.concatenate([part.scans for part in sessions]),
-        np.concatenate([part.poses for part in sessions]),
-        np.concatenate([part.e for part in sessions]),
-        np.concatenate([part.nodes + k for part, k in zip(sessions, keyframes, strict=False)]),
-    )
+    own = {name: join(name, sessions) for name in ("scans", "poses", "e")}
+    return Keyframes(recording, nodes=join("nodes", sessions, begins(map(len, sessions))), **own)

@@ -78,7 +78,7 @@ def merge_sessions(
     threads = resolve_threads(job.options.threads)
     with atomic_folder(output, RECORD, overwrite) as folder:
         (folder / "sessions").mkdir()
-        place, refusals, order = _open_base(job, folder)
+        place, refusals, order = _open_base(job, folder, threads)
         if place is not None:
             frame, options = job.frame or place.frame, _adopt_cells(job.options, place)
             job = replace(job, frame=frame, options=options)
@@ -101,15 +101,17 @@ def merge_sessions(
     return result
 
 
-def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[PlaceSession], list[str]]:
+def _open_base(
+    job: MergeJob, folder: Path, threads: int
+) -> tuple[Place | None, list[PlaceSession], list[str]]:
     """The place to which sessions are added, what it keeps copied; nothing for a new place."""
     if job.base is None:
         return None, [], []
-    place, refusals, order = read_place(job.base)
+    place, refusals, order = read_place(job.base, threads)
     for placed in place.sessions:
         name = placed.session.name
         copy_session(job.base / "sessions" / name, folder / "sessions" / name)
-    return place, refusals, order
+    return update_evidence(place, threads), refusals, order
 
 
 def _adopt_cells(options: Options, place: Place) -> Options:
@@ -288,7 +290,8 @@ def _require_apart(output: Path, job: MergeJob) -> None:
     Raises:
         InputError: it does.
     """
-    inputs = [path for session in job.sessions for path in session.parts]
+    groups = [session.given for session in job.sessions]
+    inputs = [path for group in groups if isinstance(group, tuple) for path in group]
     for path in inputs if job.base is None else [job.base, *inputs]:
         if output.resolve() in (path.resolve(), *path.resolve().parents):
             raise InputError("is one of the sessions, or holds one", where=str(output))

@@ -231,12 +231,13 @@ def update_evidence(place: Place, threads: int, max_motion: float = MAX_MOTION) 
 
 
 def _measure(placed: PlacedSession, place: Place, limit: float, threads: int) -> PlacedSession:
-    poses = placed.keyframe_poses
+    session, poses = placed.session, placed.keyframe_poses
     if placed.measured_at is not None:
         moved = np.linalg.norm((poses - placed.measured_at)[:, :-1, -1], axis=1)
         if moved.max() <= limit:
-            return placed
-    session = placed.session
+            if placed.evidence is not None:
+                return placed
+            poses = placed.measured_at  # of a place that was read: as it was
     planar = measure_evidence(session.planar, to_planar(session, poses), place.resolution, threads)
     evidence = planar
     if session.dimension == 3:

@@ -1,7 +1,7 @@
 """Files of a place: `sessions/NAME/` is enough to merge further ones without the recording.
 
-`state/` holds flat arrays, the keyframes as recording folders, and evidence; `ties.npz` of the
-place the constraints between sessions.
+`state/` holds flat arrays and the keyframes as a recording folder, from which all else follows;
+`ties.npz` of the place the constraints between sessions.
 """
 
 import os
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.array_folder import parse, read_array, read_npz, read_poses, write_arrays
-from stillmap.core.array_types import Int64
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
-from stillmap.places.evidence import BLOCK, BeamCells, Evidence
+from stillmap.places.evidence import BeamCells
 from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.place import Place, PlacedSession, Tie
 from stillmap.results.folder import ResultFolder
@@ -30,13 +30,14 @@ from stillmap.results.near_result import MAX_DISTANCE
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 from stillmap.results.reader import RECORD, SESSIONS, read_labels, read_run, read_tracks
 from stillmap.results.timeline import HINT, PlaceSession, read_sessions
+from stillmap.slam import PoseGraph
 
 STATE, TIES = "state", "ties.npz"
 # in the record of a session: of the frame that a place has it in, in the map frame of its result
 SESSION_ORIGIN = "session_origin"
 _BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
 _MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
-_KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
+_KEYFRAMES, _GRAPH = "keyframes", "graph.g2o"
 _TIES = ("first", "first_node", "second", "second_node")
 
 _Edge = Annotated[float, Meta(gt=0.0, lt=100.0)]
@@ -51,48 +52,31 @@ class _Settings:
     frame: str
 
 
-def write_session(home: Path, session: Session, beams: BeamCells) -> None:
-    """Write the state of a session into its existing folder `sessions/NAME`."""
-    state = home / STATE
-    state.mkdir()
-    write_arrays(
-        state,
-        {
-            "poses": session.poses,
-            "clearance": session.clearance,
-            "cells": beams.cells,
-            "cell_node": beams.node,
-            "beam_cell": beams.of_beam,
-            "p_static": beams.p_static,
-        },
-    )
-    write_g2o(state / _GRAPH, session.graph, session.poses)
-    _write_keyframes(state / _KEYFRAMES, session.keyframes)
-    if session.dimension == 3:
-        _write_keyframes(state / _PLANAR, session.planar)
+def write_session(
+    home: Path, poses: Float, graph: PoseGraph, keyframes: Keyframes, beams: BeamCells
+) -> None:
+    """Write what a place keeps of a session into its existing folder `sessions/NAME`: all else
+    follows from it.
 
-
-def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:
-    folder.mkdir()
+    Args:
+        home: the folder.
+        poses: (T, D+1, D+1) T_session_base.
+        graph: the session's own pose graph.
+        keyframes: its keyframes.
+        beams: the cells of all its beams.
+    """
+    state, folder = home / STATE, home / STATE / _KEYFRAMES
+    folder.mkdir(parents=True)
+    cells = {"cells": beams.cells, "cell_node": beams.node, "beam_cell": beams.of_beam}
+    write_arrays(state, {"poses": poses, **cells, "p_static": beams.p_static})
+    write_g2o(state / _GRAPH, graph, poses)
     stillmap_folder.write_into(keyframes.recording, folder)
-    of = {"scans": keyframes.scans.astype(np.int64), "nodes": keyframes.nodes.astype(np.int64)}
-    write_arrays(folder, {**of, "poses": keyframes.poses, "e": keyframes.e})
+    write_arrays(folder, {"scans": keyframes.scans.astype(np.int64), "e": keyframes.e})
 
 
 def write_placement(home: Path, placed: PlacedSession) -> None:
-    """Write where a session lies in its place, and its evidence there."""
-    state = home / STATE
-    evidence, planar = placed.require_evidence()
-    of = {"nodes": placed.nodes, "covariance": placed.covariance, "measured_at": placed.measured_at}
-    write_arrays(state, of)
-    _write_evidence(state / "evidence.npz", evidence)
-    if planar is not evidence:
-        _write_evidence(state / "planar_evidence.npz", planar)
-
-
-def _write_evidence(path: Path, evidence: Evidence) -> None:
-    of = {name: getattr(evidence, name) for name in ("corner", "hits", "passes")}
-    write_npz(path, {**of, "resolution": np.array(evidence.resolution)})
+    """Write where a session lies in its place, and where its evidence was measured."""
+    write_arrays(home / STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
 
 
 def write_ties(path: Path, ties: Sequence[Tie], D: int) -> None:
@@ -127,11 +111,12 @@ def copy_session(source: Path, target: Path) -> None:
         copy_content(f"{source}/{name}", f"{target}/{name}")
 
 
-def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
+def read_place(folder: Path, threads: int = 1) -> tuple[Place, list[PlaceSession], list[str]]:
     """A place, the sessions that are not in it, and the names of all in their order.
 
     Args:
         folder: which `stillmap merge` wrote.
+        threads: number of threads.
 
     Raises:
         InputError: a file is missing or damaged.
@@ -146,7 +131,7 @@ def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
     if settings.frame not in accepted:
         raise _inconsistent(folder / RECORD)
     sessions = [
-        _read_placed(folder / "sessions" / name, accepted[name], settings.voxel_size)
+        _read_placed(folder / "sessions" / name, accepted[name], settings.voxel_size, threads)
         for name in order
     ]
     if len({placed.session.dimension for placed in sessions}) != 1:
@@ -159,25 +144,57 @@ def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
     return place, refused, [record.name for record in records]
 
 
-def _read_placed(home: Path, record: PlaceSession, voxel_size: float) -> PlacedSession:
-    stamp_ns, n_beams = _read_beams(home / "beams")
-    session, state = read_session(home, record.input, stamp_ns), home / STATE
-    _check_beam_cells(home, read_beam_cells(home, n_beams, voxel_size), session)
+def _read_placed(
+    home: Path, record: PlaceSession, voxel_size: float, threads: int
+) -> PlacedSession:
+    session, state = read_session(home, record.input, threads), home / STATE
+    read_beam_cells(home, session, voxel_size)
     read_tracks(state / "objects" / "objects.json")
     D, N, K = session.dimension, len(session.graph.keyframes), len(session.keyframes)
+    covariance = np.asarray(record.covariance)
+    if len(covariance) != 3 * (D - 1):
+        raise _inconsistent(home)
     nodes = read_poses(state / "nodes.npy", N, D, MAX_DISTANCE)
     measured_at = read_poses(state / "measured_at.npy", K, D, MAX_DISTANCE)
-    covariance = np.array(read_array(state / "covariance.npy", (3 * (D - 1),) * 2, np.float64))
-    if not np.isfinite(covariance).all():
-        raise _inconsistent(state / "covariance.npy")
-    evidence = planar = _read_evidence(state / "evidence.npz", D)
-    if D == 3:
-        planar = _read_evidence(state / "planar_evidence.npz", 2)
-    return PlacedSession(session, nodes, covariance, record.overlap, evidence, planar, measured_at)
+    return PlacedSession(session, nodes, covariance, record.overlap, measured_at=measured_at)
 
 
-def _read_beams(folder: Path) -> tuple[Int64, int]:
-    """(T,) stamps of the scans of a session, and the number of its beams."""
+def read_session(home: Path, path: str | None, threads: int = 1) -> Session:
+    """The session that `write_session` wrote; arrays are memory-mapped.
+
+    Args:
+        home: `sessions/NAME` of a place.
+        path: of its input, as it was given; None: it had none.
+        threads: number of threads.
+
+    Raises:
+        InputError: a file is missing, damaged, or inconsistent with the others.
+    """
+    state, folder = home / STATE, home / STATE / _KEYFRAMES
+    stamp_ns, recording = _read_stamps(home / "beams"), read_recording(folder)
+    K, D, T = recording.n_scans, recording.dimension, len(stamp_ns)
+    scans = np.array(read_array(folder / "scans.npy", (K,), np.int64), np.intp)
+    e = read_array(folder / "e.npy", (recording.n_beams,), np.float32)
+    poses, graph = read_poses(state / "poses.npy", T, D, MAX_DISTANCE), read_g2o(state / _GRAPH)
+    rises = K > 0 and scans[0] >= 0 and scans[-1] < T and bool((np.diff(scans) > 0).all())
+    fits = graph.poses.shape[-1] == D + 1 and bool(np.isin(graph.keyframes, scans).all())
+    if (
+        not (rises and fits)
+        or not np.allclose(graph.poses, poses[graph.keyframes])
+        or not ((e >= 0.0) & (e <= 1.0)).all()
+    ):
+        raise _inconsistent(state)
+    keyframes = Keyframes(
+        recording, scans, poses[scans], e, np.searchsorted(scans, graph.keyframes)
+    )
+    run = ResultFolder(home, read_run(home))
+    output, origin = run.output_options, run.read_origin(SESSION_ORIGIN)
+    band = output.min_obstacle_height, output.max_obstacle_height
+    return Session.of(home.name, path, stamp_ns, poses, graph, keyframes, band, origin, threads)
+
+
+def _read_stamps(folder: Path) -> Int64:
+    """(T,) stamps of the scans of a session."""
     stamp_ns = np.array(read_array(folder / "stamp_ns.npy", (None,), np.int64))
     offset = np.array(read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64))
     # compared, not subtracted: differences of numbers from a file may overflow
@@ -185,95 +202,29 @@ def _read_beams(folder: Path) -> tuple[Int64, int]:
     if not len(stamp_ns) or offset[0] != 0 or not rises:
         raise _inconsistent(folder)
     read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
-    return stamp_ns, int(offset[-1])
+    return stamp_ns
 
 
-def read_session(home: Path, path: str | None, stamp_ns: Int64) -> Session:
-    """The session that `write_session` wrote; arrays are memory-mapped.
-
-    Args:
-        home: `sessions/NAME` of a place.
-        path: of its input, as it was given; None: it had none.
-        stamp_ns: (T,) stamps of its scans.
-
-    Raises:
-        InputError: a file is missing, damaged, or inconsistent with the others.
-    """
-    state = home / STATE
-    keyframes = _read_keyframes(state / _KEYFRAMES)
-    D, K = keyframes.dimension, len(keyframes)
-    planar = _read_keyframes(state / _PLANAR) if D == 3 else keyframes
-    poses = read_poses(state / "poses.npy", len(stamp_ns), D, MAX_DISTANCE)
-    graph = read_g2o(state / _GRAPH)
-    clearance = np.array(read_array(state / "clearance.npy", (K,), np.float64))
-    if (
-        planar.dimension != 2
-        or len(planar) != K
-        or graph.poses.shape[-1] != D + 1
-        or not np.array_equal(keyframes.scans[keyframes.nodes], graph.keyframes)
-        or keyframes.scans[-1] >= len(poses)
-        or not np.array_equal(keyframes.poses, poses[keyframes.scans])
-        or not (np.abs(clearance) < MAX_DISTANCE).all()
-    ):
-        raise _inconsistent(state)
-    origin = ResultFolder(home, read_run(home)).read_origin(SESSION_ORIGIN)
-    return Session(home.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, origin)
-
-
-def _read_keyframes(folder: Path) -> Keyframes:
-    recording = read_recording(folder)
-    K, name = recording.n_scans, folder / "poses.npy"
-    scans = np.array(read_array(folder / "scans.npy", (K,), np.int64), np.intp)
-    nodes = np.array(read_array(folder / "nodes.npy", (None,), np.int64), np.intp)
-    D = read_array(name, (K, None, None), np.float64).shape[1] - 1
-    poses = read_poses(name, K, D, MAX_DISTANCE) if D in (2, 3) else np.zeros(0)
-    e = read_array(folder / "e.npy", (recording.n_beams,), np.float32)
-    if not K or not len(nodes) or np.any(np.diff(scans) <= 0) or np.any(np.diff(nodes) <= 0):
-        raise _inconsistent(folder)
-    if nodes[0] < 0 or nodes[-1] >= K or scans[0] < 0 or not ((e >= 0.0) & (e <= 1.0)).all():
-        raise _inconsistent(folder)
-    return Keyframes(recording, scans, poses, e, nodes)
-
-
-def read_beam_cells(home: Path, n_beams: int, resolution: float) -> BeamCells:
+def read_beam_cells(home: Path, session: Session, resolution: float) -> BeamCells:
     """The cells, of edges of `resolution` m, in which the beams of a session ended; mapped files.
 
     Raises:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
-    state = home / STATE
-    cells = read_array(state / "cells.npy", (None, None), np.int32)
+    state, n_beams = home / STATE, len(read_array(home / "beams" / "hit.npy", (None,), np.bool_))
+    cells = read_array(state / "cells.npy", (None, session.dimension), np.int32)
     node = read_array(state / "cell_node.npy", (len(cells),), np.int32)
     of_beam = read_array(state / "beam_cell.npy", (n_beams,), np.int32)
     p_static = read_array(state / "p_static.npy", (n_beams,), np.float16)
-    return BeamCells(cells, node, of_beam, p_static, resolution)
-
-
-def _check_beam_cells(home: Path, beams: BeamCells, session: Session) -> None:
-    """Refuse cells and labels of beams that cannot be those of a session."""
-    if beams.cells.shape[1:] != (session.dimension,):
-        raise _inconsistent(home / STATE)
     for values, first, last in (
-        (beams.node, 0, len(session.graph.keyframes) - 1),
-        (beams.of_beam, -1, len(beams.cells) - 1),
-        (beams.p_static, 0, 1),
+        (node, 0, len(session.graph.keyframes) - 1),
+        (of_beam, -1, len(cells) - 1),
+        (p_static, 0, 1),
     ):
         for block in arrays.iter_blocks(values):
             if ((values[block] < first) | (values[block] > last)).any():
-                raise _inconsistent(home / STATE)
-
-
-def _read_evidence(path: Path, D: int) -> Evidence:
-    corner, hits, passes, resolution = read_npz(
-        path, ("corner", "hits", "passes", "resolution"), _MAX_ARRAY, HINT
-    ).values()
-    shape = (len(corner), *(BLOCK[D],) * D)
-    fits = corner.shape == (len(corner), D) and hits.shape == shape and passes.shape == shape
-    kinds = corner.dtype == np.int32 and hits.dtype == np.uint8 and passes.dtype == np.uint8
-    is_usable = fits and kinds and resolution.shape == () and 0.0 < float(resolution) < 100.0
-    if not is_usable or np.any(corner % BLOCK[D]):
-        raise _inconsistent(path)
-    return Evidence(corner, hits, passes, float(resolution))
+                raise _inconsistent(state)
+    return BeamCells(cells, node, of_beam, p_static, resolution)
 
 
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:

@@ -64,8 +64,9 @@ class ResultFolder(ShortRepr):
 
     @property
     def output_options(self) -> OutputOptions:
-        """Region and mode of its map, and defaults."""
-        return self._resolve(self._section("output", "region", "map_mode")).output
+        """Region and mode of its map, the band of its obstacles, and defaults."""
+        keys = "region", "map_mode", "min_obstacle_height", "max_obstacle_height"
+        return self._resolve(self._section("output", *keys)).output
 
     def _section(self, name: str, *keys: str) -> dict[str, Any]:
         """Some entries of a section of the options in the record, those that are there."""
