@@ -69,7 +69,7 @@ COMMANDS: dict[Callable[[Path, Path], list[str]], tuple[str, ...]] = {
         *(
             f"place/sessions/map1/{name}"
             for name in (
-                *("run.json", "beams/hit.npy", "state/evidence.npz"),
+                *("run.json", "beams/hit.npy", "state/measured_at.npy"),
                 *("state/nodes.npy", "state/graph.g2o", "state/objects/objects.json"),
                 *("state/keyframes/recording.json", "state/keyframes/points.npy"),
             )
