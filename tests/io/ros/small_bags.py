@@ -9,8 +9,9 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
+from stillmap.io.ros.message_fields import make_header
 from stillmap.io.ros.messages import load_typestore
-from stillmap.io.ros.writer import make_header, make_message
+from stillmap.io.ros.writer import make_message
 
 KINDS = ("bag", "db3", "mcap", "folder")
 FLOAT, DOUBLE, UINT32, UINT16 = 7, 8, 6, 4

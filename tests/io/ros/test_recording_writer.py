@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import writers
-from stillmap.io.ros.writer import LaserScanEncoder, write_recording
+from stillmap.io.ros.message_fields import LaserScanEncoder
+from stillmap.io.ros.writer import write_recording
 from stillmap.sim import scene_by_name, simulate
 
 KINDS = {"bag": "out.bag", "ros2": "out", "db3": "out.db3", "mcap": "out.mcap"}

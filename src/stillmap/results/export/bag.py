@@ -12,15 +12,14 @@ from stillmap.core.grid_map import limit_hits
 from stillmap.core.local_frame import find_origin, shift_poses
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
-from stillmap.io.ros import writer as ros
+from stillmap.io.ros import message_fields as ros
+from stillmap.io.ros.message_fields import BASE, MAP, ODOM, Fields, LaserScanEncoder
 from stillmap.io.ros.messages import LASER_SCAN, ODOMETRY, POINT_CLOUD, TF, BagKind
 from stillmap.io.ros.writer import (
-    BASE,
-    MAP,
-    ODOM,
+    GRID,
+    MARKERS,
+    PATH,
     BagWriter,
-    Fields,
-    LaserScanEncoder,
     new_bag,
     number_names,
     require_stamps,
@@ -109,10 +108,10 @@ def _write_latched_topics(bag: BagWriter, result: MappedPlace) -> None:
     """Map and trajectory, as one latched message each."""
     stamp_ns, grid = result.recording.stamp_ns, result.map
     first = int(stamp_ns[0])
-    send = bag.add_topic("/map", ros.GRID, latched=True)
+    send = bag.add_topic("/map", GRID, latched=True)
     corner = se2.matrix(*grid.origin)
     send(first, ros.make_occupancy_grid(first, grid.p_occupied, corner, grid.resolution))
-    send = bag.add_topic("/trajectory", ros.PATH, latched=True)
+    send = bag.add_topic("/trajectory", PATH, latched=True)
     send(first, ros.make_path(stamp_ns, result.poses))
 
 
@@ -204,7 +203,7 @@ def _make_object_writer(
 
     Each message begins with a marker that removes the earlier ones.
     """
-    send = bag.add_topic("/objects", ros.MARKERS)
+    send = bag.add_topic("/objects", MARKERS)
     present_at, shown = iter_present_tracks(tracks, stamp_ns), list[int]()
 
     def write_markers(t: int) -> None:
