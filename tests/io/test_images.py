@@ -36,14 +36,13 @@ def said(path: Path) -> str:
 
 def test_what_is_no_picture_is_named_once(picture):
     picture.write_bytes(b"nothing")
-    assert said(picture) == f"{picture}: is no image"
+    assert said(picture) == f"{picture}: is no image, or damaged"
 
 
 def test_a_picture_that_is_cut(picture):
     picture.write_bytes(picture.read_bytes()[:1000])
     assert read_image_size(picture) == (32, 32)
-    assert said(picture).startswith(f"{picture}: is no image: ")
-    assert said(picture).count(picture.name) == 1
+    assert said(picture) == f"{picture}: is no image, or damaged"
 
 
 def test_a_picture_that_is_gone(picture):
@@ -70,7 +69,7 @@ def test_a_picture_that_wants_all_memory_is_damaged(picture, monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr(ImageFile.ImageFile, "load", load)
-    assert said(picture) == f"{picture}: is no image: it does not fit into memory"
+    assert said(picture) == f"{picture}: is no image, or damaged"
 
 
 def test_a_small_file_does_not_unpack_to_a_gigabyte(tmp_path):
@@ -118,4 +117,4 @@ def test_other_formats_are_refused_whatever_the_name(format, picture, monkeypatc
     image = Image.open(picture)
     image.load()
     image.convert("P" if format == "GIF" else "RGB").save(picture, format=format)
-    assert said(picture) == f"{picture}: is no image"
+    assert said(picture) == f"{picture}: is no image, or damaged"

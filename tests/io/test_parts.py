@@ -179,7 +179,7 @@ def breaks(whole):
         "it is of the same time": cut(whole, 2.0, 5.9),
         "it is 3D": cut(make_recording(3), 3.0, 5.9),
         "one of them has no odometry": second.without_odometry(),
-        "its odometry begins 1.4": anew(second),
+        "its odometry begins anew": anew(second),
         "it has other sensors": replace(second, source=Source(sensors=[SensorNotes("/front")])),
     }
 

@@ -262,7 +262,11 @@ def test_damaged_pictures_are_skipped(scenes):
     found = read(scenes)
     assert found.n_scans == 3
     reasons = set(found.source.skipped)
-    assert {"holds no depth", "is of another size than the first", "is no image"} < reasons
+    assert {
+        "holds no depth",
+        "is of another size than the first",
+        "is no image, or damaged",
+    } < reasons
     assert "is no depth image" in reasons
 
 
@@ -289,13 +293,8 @@ def test_a_camera_file_says_how_depth_is_seen(scenes, tmp_path):
     file.write_text(file.read_text().replace("[color]", "[depth]"))
     found = read(scenes, ReadOptions(depth_step=1, cameras=str(file)))
     np.testing.assert_array_equal(found.points.reshape(half.shape), half)
-    said = "camera 'depth': its principal point, 31.5, 2350, lies outside images"
-    assert not any(said in text for text in found.source.warnings)
-    file.write_text(file.read_text().replace("cy = 23.5", "cy = 2350"))
-    found = read(scenes, ReadOptions(cameras=str(file)))
-    assert any(said in text for text in found.source.warnings)
     file.write_text("[dept]\nfx = 3\n")
-    with pytest.raises(InputError, match=r"no camera 'dept' \(nearest: 'depth'"):
+    with pytest.raises(InputError, match=r"no camera 'dept' \(has: depth"):
         read(scenes, ReadOptions(cameras=str(file)))
     file.write_text("[depth]\nwidth = 5\nheight = 7\n")
     with pytest.raises(InputError, match="the size given for 'depth' differs"):

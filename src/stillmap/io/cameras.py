@@ -21,12 +21,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.config import CheckedOptions, load_toml, override
-from stillmap.core.errors import InputError, closest_match
+from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.text_lines import (
@@ -171,10 +171,7 @@ def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str
             hint = "a camera is a table: [NAME], with its values below"
             raise InputError(f"'{name}' stands outside of a camera", where=where, hint=hint)
         if known is not None and name not in known and "folder" not in table:
-            hint = "the recording has no images; folder = '...' adds some"
-            if known:
-                nearest = closest_match(name, known, min_similarity=0.0)
-                hint = f"nearest: '{nearest}'; folder = '...' adds one"
+            hint = f"has: {', '.join(known) or 'no images'}; folder = '...' adds some"
             raise InputError(f"there is no camera '{name}'", where=where, hint=hint)
         try:
             out[name] = override(CameraOverride(), table)
@@ -213,27 +210,6 @@ def apply_camera_file(recording: Recording, path: Path) -> Recording:
             raise InputError(error.what, where=error.where, hint=hint) from error
     merged = merge_images(parts)
     return replace(recording, images=merged if merged.cameras else None)
-
-
-def add_calibration_warnings(recording: Recording) -> Recording:
-    """Add a warning for each camera whose calibration is implausible, unless it is there."""
-    cameras = recording.images.cameras if recording.images is not None else ()
-    warnings = recording.source.warnings
-    new = [what for camera in cameras if (what := validate_camera(camera)) and what not in warnings]
-    return replace(recording, source=replace(recording.source, warnings=[*warnings, *new]))
-
-
-def validate_camera(camera: Camera) -> str:
-    """A warning where the principal point lies outside the image; else ""."""
-    if camera.K is None or not np.isfinite(camera.K).all():
-        return ""
-    at, size = camera.K[:2, 2], np.array([camera.width, camera.height])
-    if not size.all() or ((at >= 0.0) & (at <= size)).all():
-        return ""
-    return (
-        f"camera '{camera.name}': its principal point, {at[0]:g}, {at[1]:g}, lies outside "
-        f"images of {size[0]} x {size[1]} pixels: valid only where they are crops of larger ones"
-    )
 
 
 def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Images:
@@ -377,12 +353,8 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
                 yield image
     except (*_DAMAGED, *_TOO_LARGE) as error:
         what = (
-            f"is no image: {str(error) or 'it does not fit into memory'}"  # a length in its header
+            "is too large an image" if isinstance(error, _TOO_LARGE) else "is no image, or damaged"
         )
         if isinstance(error, OSError) and error.strerror:
             what = f"cannot be read: {error.strerror}"
-        elif isinstance(error, _TOO_LARGE):
-            what = "is too large an image"
-        elif isinstance(error, UnidentifiedImageError):
-            what = "is no image"
         raise InputError(what, where=str(path)) from error

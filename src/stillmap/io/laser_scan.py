@@ -42,7 +42,7 @@ def beam_angles(recording: Recording) -> Float:
     """(T, 2) first angle and signed angle step of every scan, in radians.
 
     As recorded where they fit the points, else fitted. A scan with fewer than two usable beams
-    gets the angles of another scan of its laser.
+    gets the angles of another scan of its laser, else a full turn.
 
     Raises:
         InputError: the recording is 3D, or the directions of a scan are not evenly spaced.
@@ -73,7 +73,9 @@ def beam_angles(recording: Recording) -> Float:
             of_laser[n] = candidate
         out[t] = candidate
     for t in undetermined:
-        out[t] = _borrow_angles(recording, t, known)
+        n = int(counts[t])
+        full_turn = -np.pi, 2 * np.pi / max(n, 1)
+        out[t] = known[int(recording.sensor[t])].get(n) or full_turn
     return out
 
 
@@ -166,18 +168,3 @@ def _fit_angles(points: Float, usable: Index) -> tuple[float, float]:
     off = usable - middle_n
     slope = float(weight @ (off * (angle - middle_a)) / (weight @ off**2))
     return float(middle_a - slope * middle_n), slope
-
-
-def _borrow_angles(
-    recording: Recording, t: int, known: dict[int, dict[int, tuple[float, float] | None]]
-) -> tuple[float, float]:
-    """Angles of another scan of the laser, where they fit; else a full turn."""
-    points = recording.points[recording.beams_of(t)].astype(np.float64)
-    usable = np.flatnonzero(np.isfinite(points[:, 0]))
-    borrowed = known[int(recording.sensor[t])].get(len(points))
-    if borrowed is not None and _fits(borrowed, points, usable):
-        return borrowed
-    # at most one usable beam: its angle is exact for any step
-    step = 2 * np.pi / max(len(points), 1)
-    angle = [np.arctan2(points[k, 1], points[k, 0]) - step * k for k in usable]
-    return (float(angle[0]) if angle else -np.pi), step

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core import arrays, se2
+from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Int32
 from stillmap.core.errors import InputError
@@ -34,9 +34,7 @@ from stillmap.prepare.time_window import TimeWindow, select_time
 
 _MAX_PAUSE = 60.0  # s between parts: recorders take less to begin a new file
 _MAX_OVERLAP = 3  # scans, of several sensors, that precede the end of the part before
-# odometry from one part to the next: faster than usual, but within reach
-_SPEED_FACTOR, _SHORTEST = 1.5, 0.02  # s between scans over which speed is measured
-_SLACK, _ROUNDING = 0.5, 0.05  # s from readings of odometry to the scans; m, rad
+_SAME_POSE = 0.05  # m, rad between poses that are one
 
 
 def read(
@@ -122,7 +120,7 @@ def _finish(
     recording = complete(recording, options, scratch)
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))
-    return cameras.add_calibration_warnings(recording)
+    return recording
 
 
 def require_mounts(recording: Recording, where: str) -> None:
@@ -205,39 +203,17 @@ def _find_break(before: Recording, after: Recording) -> str:
     overlap = int(np.searchsorted(after.stamp_ns, before.stamp_ns[-1], side="right"))
     if overlap and (overlap > _MAX_OVERLAP or 2 * overlap >= min(before.n_scans, after.n_scans)):
         return "it is of the same time"
-    if before.T_odom_base is None or after.T_odom_base is None:
-        return ""
-    return _find_jump(before, after, before.T_odom_base, after.T_odom_base)
-
-
-def _find_jump(before: Recording, after: Recording, A: Float, B: Float) -> str:
-    """The gap between the poses of one part and the one before; "" where they go on."""
-    step = _measure_motions(A[-1:], B[:1])[0]
-    seconds = abs(int(after.stamp_ns[0]) - int(before.stamp_ns[-1])) / 1e9 + _SLACK
-    fast = np.maximum(_quantile_speed(before, A), _quantile_speed(after, B))
-    reach = np.maximum(_SPEED_FACTOR * fast, 1.0) * seconds + _ROUNDING
-    starts_anew = np.allclose(B[0], np.eye(len(B[0]))) and step.max() > _ROUNDING
-    if starts_anew or (step > reach).any():
-        return f"its odometry begins {step[0]:.2f} m and {np.degrees(step[1]):.0f} degrees apart"
+    if _starts_anew(before.T_odom_base, after.T_odom_base):
+        return "its odometry begins anew"
     return ""
 
 
-def _quantile_speed(recording: Recording, T: Float) -> Float:
-    """(2,) m/s and rad/s, the 0.98 quantiles of the motion along poses (T, D+1, D+1)."""
-    if len(T) < 2:
-        return np.zeros(2)
-    seconds = np.maximum(np.diff(recording.stamp_ns) / 1e9, _SHORTEST)
-    speeds = _measure_motions(T[:-1], T[1:]) / seconds[:, None]
-    return np.asarray(np.quantile(speeds, 0.98, axis=0))
-
-
-def _measure_motions(A: Float, B: Float) -> Float:
-    """(n, 2) distances, m, and angles, rad, between poses (n, D+1, D+1)."""
-    step, D = se2.inverse(A) @ B, A.shape[-1] - 1
-    # the angle of a rotation in any dimension follows from its trace
-    cosine = (np.trace(step[:, :D, :D], axis1=1, axis2=2) - (D - 2)) / 2.0
-    metres = np.linalg.norm(step[:, :D, D], axis=1)
-    return np.stack([metres, np.arccos(np.clip(cosine, -1.0, 1.0))], axis=1)
+def _starts_anew(before: Float | None, after: Float | None) -> bool:
+    """True if poses (T, D+1, D+1) begin at zero again, elsewhere than those before end."""
+    if before is None or after is None:
+        return False
+    is_zero = np.allclose(after[0], np.eye(len(after[0])))
+    return is_zero and not np.allclose(after[0], before[-1], atol=_SAME_POSE)
 
 
 def join_recordings(
@@ -281,8 +257,9 @@ def join_recordings(
                 builder.append(column[block])
         return reorder_scans(builder.finish(), length, order, scratch)
 
-    is_posed = _are_continuous(parts)
-    if not is_posed and any(part.T_recorded_base is not None for part in parts):
+    posed = [part.T_recorded_base for part in parts]
+    is_posed = not any(_starts_anew(*pair) for pair in pairwise(posed))
+    if not is_posed:
         text = "the recorded poses of the parts do not continue each other: not used"
         source.warnings.append(text)
     images = [part.images for part in parts if part.images is not None]
@@ -300,15 +277,6 @@ def join_recordings(
         images=cameras.merge_images(images) if images else None,
         scratch=scratch,
     )
-
-
-def _are_continuous(parts: Sequence[Recording]) -> bool:
-    """True if all parts have recorded poses, which go on from one to the next."""
-    for before, after in pairwise(parts):
-        A, B = before.T_recorded_base, after.T_recorded_base
-        if A is None or B is None or _find_jump(before, after, A, B):
-            return False
-    return True
 
 
 def _join_sensors(parts: Sequence[Recording]) -> tuple[Float, Int32, list[SensorNotes]]:

@@ -286,7 +286,6 @@ def read_depth_camera(
     error = camera_module.calibration_error(camera)
     if error:
         raise InputError(f"cannot be used: {error}", where=str(frames.depth[0][1]))
-    warnings += [warning] if (warning := cameras.validate_camera(camera)) else []
     return camera
 
 

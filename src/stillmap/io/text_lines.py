@@ -93,8 +93,6 @@ def read_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
                 number += 1
                 size_read += len(text) + _LINE_COST
                 is_whole = text.endswith(b"\n") or len(text) < MAX_LINE
-                if not is_whole:
-                    size_read += _skip_rest(stream, limit - size_read)
                 if size_read > limit:
                     what = f"is too large: it decompresses to more than {_MAX_RATIO} times its size"
                     hint = "decompress it first"
@@ -106,16 +104,6 @@ def read_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
             yield Line(number + 1, b"", "its gzip stream breaks")
         except OSError as error:
             raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-
-
-def _skip_rest(stream: IO[bytes] | gzip.GzipFile, limit: int) -> int:
-    """Skip to the end of the line, or a little beyond `limit` bytes; returns the number skipped."""
-    skipped = 0
-    while skipped <= limit and (rest := stream.readline(MAX_LINE)):
-        skipped += len(rest)
-        if rest.endswith(b"\n"):
-            break
-    return skipped
 
 
 def replace_words(line: bytes, words: Mapping[int, bytes]) -> bytes:
