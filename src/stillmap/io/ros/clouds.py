@@ -27,7 +27,6 @@ from stillmap.io.ros.messages import (
     TIME_BACKWARDS,
     Message,
     SkippedByTopic,
-    decode,
     frame_name,
     stamp_ns,
 )
@@ -132,9 +131,8 @@ class CloudCollector:
         self.number = array("q")
         self.scans = RecordingBuilder(3, scratch, beam_times=True)
 
-    def add(self, message: Message, number: int) -> str | None:
+    def add(self, message: Message, raw: Any, number: int) -> str | None:
         """Add a message, by its number on the topic; returns the reason if it cannot be used."""
-        raw = decode(message)
         cloud = parse_cloud(raw)
         if isinstance(cloud, str):
             return cloud
@@ -158,7 +156,7 @@ class CloudCollector:
 
 def read_clouds(
     clouds: CloudCollector,
-    frames: tf.Frames,
+    tree: tf.TransformTree,
     options: ReadOptions,
     find_images: Callable[[str], Images | None],
 ) -> Recording:
@@ -177,7 +175,7 @@ def read_clouds(
     # most points first: other clouds are derived from these
     order = sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
     sensors = [tf.Sensor(*names[k], stamps[sensor == k]) for k in order]
-    poses = tf.place_sensors(frames, sensors, options)
+    poses = tf.place_sensors(tree, sensors, options)
     chosen = [order[k] for k in poses.used]
     rows = [clouds.forward_scans(k) for k in chosen]
     T, warnings = np.tile(np.eye(4), (len(names), 1, 1)), list(poses.warnings)
@@ -186,7 +184,7 @@ def read_clouds(
         if np.abs(of_scans - of_scans[0]).max() > _STILL:
             text = "the sensor moves on the robot: its first pose is used"
             warnings.append(f"{names[k][0]}: {text}")
-    odom, origin = tf.find_odometry(frames, poses.base, stamps, options, warnings)
+    odom, origin = tf.find_odometry(tree, poses.base, stamps, options, warnings)
     described = zip(names, counts, strict=True)
     recording = clouds.scans.build(
         T,

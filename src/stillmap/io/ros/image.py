@@ -56,14 +56,10 @@ class ImageCollector:
         self._infos: dict[str, Any] = {}  # CameraInfo by topic
         self._frames: dict[str, str] = {}
 
-    def add_message(self, message: Message) -> None:
-        """Add a message; one that cannot be decoded is ignored."""
+    def add_message(self, message: Message, content: Any) -> None:
+        """Add a message, and what was decoded of it."""
         topic = message.channel.topic
-        try:
-            content = decode(message)
-            stamp, frame = stamp_ns(content.header), frame_name(content.header.frame_id)
-        except Exception:  # any error of rosbags about damaged bytes
-            return
+        stamp, frame = stamp_ns(content.header), frame_name(content.header.frame_id)
         if message.channel.type == CAMERA_INFO:
             self._infos.setdefault(topic, content)
             return

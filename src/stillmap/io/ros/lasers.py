@@ -25,7 +25,6 @@ from stillmap.io.ros.messages import (
     TIME_BACKWARDS,
     Message,
     SkippedByTopic,
-    decode,
     frame_name,
     stamp_ns,
 )
@@ -159,9 +158,9 @@ class LaserCollector:
         self._scratch, self.skipped = scratch, skipped
         self._lasers: dict[tuple[str, str], LaserScans] = {}
 
-    def add(self, message: Message, number: int) -> str | None:
+    def add(self, message: Message, scan: Any, number: int) -> str | None:
         """Add a message, by its number on the topic; returns the reason if it cannot be used."""
-        topic, scan = message.channel.topic, decode(message)
+        topic = message.channel.topic
         frame = frame_name(scan.header.frame_id)
         ranges = _first_echoes(scan) if message.channel.type == MULTI_ECHO else scan.ranges
         laser = self._lasers.get((topic, frame)) or LaserScans(topic, frame, self._scratch)
@@ -191,7 +190,11 @@ def _first_echoes(scan: Any) -> Float32:
 
 
 def read_lasers(
-    collector: LaserCollector, frames: tf.Frames, context: ReadContext, *, tilting: bool = False
+    collector: LaserCollector,
+    tree: tf.TransformTree,
+    context: ReadContext,
+    *,
+    tilting: bool = False,
 ) -> RawLasers:
     """The 2D scans of all lasers, or those of a laser that tilts, to become a 3D recording.
 
@@ -200,7 +203,7 @@ def read_lasers(
     """
     scans, options = collector.finish(), context.options
     sensors = [tf.Sensor(s.topic, s.frame, s.raw.stamp_ns) for s in scans]
-    poses = tf.place_sensors(frames, sensors, options)
+    poses = tf.place_sensors(tree, sensors, options)
     used = [scans[k] for k in poses.used]
     skipped = SkippedRecords().merge(*(collector.skipped[t] for t in {s.topic for s in used}))
     losses = skipped.loss_warnings(sum(s.n_scans for s in used), "message")
@@ -213,7 +216,7 @@ def read_lasers(
     )
     if tilting:
         warnings += losses
-        return _read_tilting_laser(used, poses, frames.tree, source, context.scratch)
+        return _read_tilting_laser(used, poses, tree, source, context.scratch)
     options.check_laser_count(len(used))
     warnings += poses.warnings
     raw, mounts = [], []
@@ -226,7 +229,7 @@ def read_lasers(
         source.sensors.append(notes)
     at = scan_order(raw)
     stamps = np.concatenate([laser.stamp_ns for laser in raw])[at]
-    odom, source.odometry = tf.find_odometry(frames, poses.base, stamps, options, warnings)
+    odom, source.odometry = tf.find_odometry(tree, poses.base, stamps, options, warnings)
     warnings += losses
     source.duplicates = poses.omitted
     T_odom_base = None if odom is None else tf.project_to_plane(odom)[0]

@@ -5,7 +5,6 @@ bag by its first bytes loads none of the libraries.
 """
 
 import re
-import struct
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -196,22 +195,6 @@ def hash_definition(channel: Channel) -> str:
 def stamp_ns(header: Any) -> int:
     """The stamp of a header in nanoseconds."""
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-
-
-def peek_stamp_ns(message: Message) -> int | None:
-    """The stamp of the header that a message begins with, without decoding the rest.
-
-    The log time where the header has none; None where the message is too short for one.
-    """
-    try:
-        if message.channel.encoding == "ros1":
-            seconds, rest = struct.unpack_from("<II", message.raw, 4)  # after the number
-        else:
-            raw = decompress(message)
-            seconds, rest = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
-    except (struct.error, IndexError):
-        return None
-    return int(seconds) * 10**9 + int(rest) or message.log_ns
 
 
 def frame_name(name: Any) -> str:

@@ -31,9 +31,9 @@ from stillmap.io.ros.messages import (
     SkippedByTopic,
     decode,
     find_fault,
-    peek_stamp_ns,
+    stamp_ns,
 )
-from stillmap.io.ros.tf import Frames, Odometry, TransformTree
+from stillmap.io.ros.tf import Odometry, TransformTree
 from stillmap.prepare.lasers import RawLasers
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow
@@ -86,16 +86,16 @@ def _read_content(
     tree, window = content.transforms, content.window
     if others and not _static_topics(bag):
         _lend_transforms(tree, others, context.scratch)
-    frames = Frames(tree, [own for own in content.odometry.values() if len(own.stamp_ns)])
+    tree.odometry = {name: own for name, own in content.odometry.items() if len(own.stamp_ns)}
     recording: Recording | RawLasers
     if any(c.type == POINT_CLOUD and uses.get(c.topic) == "scans" for c in bag.channels):
 
         def find_images(base: str) -> Images | None:
             return window.select_images(content.images.build_images(tree, base, bag.reopen))
 
-        recording = read_clouds(content.clouds, frames, context.options, find_images)
+        recording = read_clouds(content.clouds, tree, context.options, find_images)
     else:
-        recording = read_lasers(content.lasers, frames, context, tilting=tilting)
+        recording = read_lasers(content.lasers, tree, context, tilting=tilting)
     source, of_odometry = recording.source, [own.skipped for own in content.odometry.values()]
     source.format, source.topics, source.skipped_unit = bag.kind, notes, "message"
     source.damage, source.part = bag.damage.by_reason(), window.part
@@ -201,14 +201,14 @@ class BagContent:
         self.unreadable = SkippedRecords()
 
     def add(self, message: Message, number: int) -> None:
-        """Add a message; scans and images outside the time window are not decoded."""
-        topic = message.channel.topic
+        """Add a message; scans and images outside the time window are left out."""
+        topic, fault = message.channel.topic, None
         use = self._uses.get(topic)
         self._count[topic] += use == "scans"
-        if not self._is_selected(message, use):
-            return
         try:
-            fault = self._collect(message, use)
+            content = decode(message)
+            if self._is_selected(message, content, use):
+                fault = self._collect(message, content, use)
         except OSError:  # the disk is full
             raise
         except Exception:  # any error of rosbags about damaged bytes
@@ -218,25 +218,25 @@ class BagContent:
         elif fault is not None:
             self.unreadable.add(f"{fault} ({topic})", number)
 
-    def _is_selected(self, message: Message, use: str | None) -> bool:
+    def _is_selected(self, message: Message, content: Any, use: str | None) -> bool:
         # one CameraInfo holds for all images
-        timed = use in ("scans", "images") and message.channel.type != CAMERA_INFO
-        stamp = peek_stamp_ns(message) if timed and self.window else None
+        if use not in ("scans", "images") or message.channel.type == CAMERA_INFO:
+            return True
         select = self.window.select if use == "scans" else self.window.contains
-        return stamp is None or select(stamp)
+        return select(stamp_ns(content.header) or message.log_ns)
 
-    def _collect(self, message: Message, use: str | None) -> str | None:
+    def _collect(self, message: Message, content: Any, use: str | None) -> str | None:
         """Add a message to those of its use; returns the reason if it cannot be used."""
         topic = message.channel.topic
         if use == "scans":
             scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
-            return scans.add(message, self._count[topic])
+            return scans.add(message, content, self._count[topic])
         if use == "images":
-            self.images.add_message(message)
+            self.images.add_message(message, content)
         elif use == "transforms":
-            self.transforms.add_message(decode(message), static=topic.endswith(_STATIC))
+            self.transforms.add_message(content, static=topic.endswith(_STATIC))
         elif use == "odometry":
-            self.odometry.setdefault(topic, Odometry(topic)).add_message(decode(message))
+            self.odometry.setdefault(topic, Odometry(topic)).add_message(content)
         else:  # of a damaged bag whose connections have the number of others
             return UNREADABLE
         return None

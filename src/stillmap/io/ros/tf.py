@@ -16,12 +16,12 @@ from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.io.trajectory import MAX_TRANSLATION
 from stillmap.prepare.options import ReadOptions
 
+BAD_TRANSFORM = "transform that is none"
 SENSOR_IS_BASE = "the sensor's frame: no transform gives its pose on a robot"
 
 _NORM_TOLERANCE = 0.05  # of a quaternion
 _BLOCK = 1 << 14  # poses interpolated at a time
 _BASE_NAMES = ("base_link", "base_footprint", "base")
-_MAX_GAP = 1.0  # s without odometry before a warning
 _MIN_UPRIGHT = 0.9  # cosine of the largest tilt of a laser that counts as level
 _MIN_SHARE = 0.25  # of the most frequent sensor's scans: rarer topics are no sensors of their own
 
@@ -40,24 +40,37 @@ class Lookup(NamedTuple):
     moves: bool
 
 
-class _Edge:
-    """The transform from a frame to its parent over time."""
+class Motion:
+    """The transform from a frame to its parent over time.
 
-    def __init__(self, parent: str) -> None:
-        self.parent = parent
-        self.stamp_ns = array("q")
-        self.values = array("d")  # x y z, quaternion x y z w
-        self.constant = False
+    Attributes:
+        stamp_ns: of each transform.
+        values: x y z, quaternion x y z w of each.
+        constant: it is the same at all times.
+    """
 
-    def sorted_by_time(self) -> "_Edge":
-        """Without duplicate stamps (the last one counts); constant if all values are equal."""
+    def __init__(self) -> None:
+        self.stamp_ns, self.values, self.constant = array("q"), array("d"), False
+
+    def add(self, stamp: int, t: Any, q: Any) -> bool:
+        """Add a translation in metres and a quaternion; False if they are invalid."""
+        values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
+        # each by itself: max() of several, NaN among them, may return any of them
+        near = all(abs(value) < MAX_TRANSLATION for value in values[:3])
+        if not near or not abs(math.hypot(*values[3:]) - 1.0) < _NORM_TOLERANCE:
+            return False
+        self.stamp_ns.append(stamp)
+        self.values.extend(values)
+        return True
+
+    def sort(self) -> None:
+        """Sort by time, without duplicate stamps (the last one counts); note that it is constant if
+        all values are equal."""
         stamps, values = np.asarray(self.stamp_ns, np.int64), np.asarray(self.values).reshape(-1, 7)
         last = len(stamps) - 1 - np.unique(stamps[::-1], return_index=True)[1]
-        out = _Edge(self.parent)
-        out.stamp_ns = array("q", stamps[last].tolist())
-        out.values = array("d", values[last].ravel())
-        out.constant = self.constant or bool(np.all(values == values[last[0]]))
-        return out
+        self.constant = self.constant or bool(np.all(values == values[last[0]]))
+        self.stamp_ns = array("q", stamps[last].tolist())
+        self.values = array("d", values[last].ravel())
 
     def interpolate(self, at_ns: Int64) -> tuple[Float, int]:
         """Transforms (N, 4, 4) at times (N,), and how many of these lie outside the known ones."""
@@ -80,57 +93,50 @@ class _Edge:
 
 
 class TransformTree:
-    """A forest of frames. Static transforms hold at all times."""
+    """A forest of frames. Static transforms hold at all times.
+
+    Attributes:
+        skipped: transforms that are none.
+        odometry: of each Odometry topic.
+    """
 
     def __init__(self) -> None:
         self.skipped = SkippedRecords()
-        self._edges: dict[str, dict[str, _Edge]] = {}  # by child, by parent
+        self.odometry: dict[str, Odometry] = {}
+        self._motions: dict[str, dict[str, Motion]] = {}  # by child, by parent
         self._number = 0
-        self._resolved: dict[str, _Edge] = {}
+        self._resolved: dict[str, tuple[str, Motion]] = {}
 
     def add_message(self, message: Any, *, static: bool) -> None:
-        """Add the transforms of a TFMessage."""
+        """Add the transforms of a TFMessage; invalid ones are counted."""
         for one in message.transforms:
             parent, child = frame_name(one.header.frame_id), frame_name(one.child_frame_id)
-            t, q = one.transform.translation, one.transform.rotation
-            self.add_transform(parent, child, stamp_ns(one.header), t, q, static=static)
-
-    def add_transform(
-        self, parent: str, child: str, stamp: int, t: Any, q: Any, *, static: bool = False
-    ) -> bool:
-        """Add a transform: a translation in metres and a quaternion; an invalid one is counted."""
-        self._number += 1
-        values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
-        # each by itself: max() of several, NaN among them, may return any of them
-        near = all(abs(value) < MAX_TRANSLATION for value in values[:3])
-        is_pose = near and abs(math.hypot(*values[3:]) - 1.0) < _NORM_TOLERANCE
-        if not (is_pose and child and parent and child != parent):
-            self.skipped.add("transform that is none", self._number)
-            return False
-        edge = self._edges.setdefault(child, {}).setdefault(parent, _Edge(parent))
-        if static:
-            edge.constant = True
-            edge.stamp_ns, edge.values = array("q", [stamp]), array("d", values)
-        elif not edge.constant:
-            edge.stamp_ns.append(stamp)
-            edge.values.extend(values)
-        self._resolved = {}
-        return True
+            t, q, stamp = one.transform.translation, one.transform.rotation, stamp_ns(one.header)
+            self._number += 1
+            given = Motion()
+            if not (given.add(stamp, t, q) and child and parent and child != parent):
+                self.skipped.add(BAD_TRANSFORM, self._number)
+                continue
+            motions = self._motions.setdefault(child, {})
+            known = motions.setdefault(parent, given)
+            if static:
+                motions[parent], given.constant = given, True
+            elif known is not given and not known.constant:
+                known.add(stamp, t, q)
+            self._resolved = {}
 
     @property
     def frames(self) -> set[str]:
         """All frames."""
-        return set(self._edges) | {p for edges in self._edges.values() for p in edges}
+        return set(self._motions) | {p for motions in self._motions.values() for p in motions}
 
     def parent(self, child: str) -> str | None:
         """The parent of a frame, None for a root."""
-        edge = self._resolve().get(child)
-        return None if edge is None else edge.parent
+        return self._resolve().get(child, (None,))[0]
 
     def is_moving(self, child: str) -> bool:
         """True if a frame moves in its parent."""
-        edge = self._resolve().get(child)
-        return edge is not None and not edge.constant
+        return child in self._resolve() and not self._resolve()[child][1].constant
 
     def path_to_root(self, child: str) -> list[str]:
         """A frame, its parent, and so on to the root."""
@@ -155,26 +161,27 @@ class TransformTree:
         """Int64 of the moving frame between source and its ancestor target with fewest stamps."""
         up = self.path_to_root(source)
         end = up.index(target) if target in up else 0
-        moving = [self._resolve()[child] for child in up[:end] if self.is_moving(child)]
-        rarest = min(moving, key=lambda edge: len(edge.stamp_ns), default=None)
-        return np.asarray(rarest.stamp_ns if rarest else [], np.int64)
+        moving = [self._resolve()[child][1] for child in up[:end] if self.is_moving(child)]
+        rarest = min(moving, key=lambda motion: len(motion.stamp_ns), default=Motion())
+        return np.asarray(rarest.stamp_ns, np.int64)
 
     def _compose(self, path: list[str], at_ns: Int64) -> Lookup:
         """Transforms from the first frame of a path to the parent of its last."""
         T = np.broadcast_to(np.eye(4), (len(at_ns), 4, 4))
         outside, moves = 0, False
         for child in path:
-            edge = self._resolve()[child]
-            step, n_outside = edge.interpolate(at_ns)
-            T, outside, moves = step @ T, max(outside, n_outside), moves or not edge.constant
+            motion = self._resolve()[child][1]
+            step, n_outside = motion.interpolate(at_ns)
+            T, outside, moves = step @ T, max(outside, n_outside), moves or not motion.constant
         return Lookup(T, outside, moves)
 
-    def _resolve(self) -> dict[str, _Edge]:
+    def _resolve(self) -> dict[str, tuple[str, Motion]]:
         """One parent per frame: a static one before others, else the most frequent."""
         if not self._resolved:
-            for child, parents in self._edges.items():
-                best = max(parents.values(), key=lambda e: (e.constant, len(e.stamp_ns)))
-                self._resolved[child] = best.sorted_by_time()
+            for child, parents in self._motions.items():
+                of_parent = max(parents.items(), key=lambda p: (p[1].constant, len(p[1].stamp_ns)))
+                of_parent[1].sort()
+                self._resolved[child] = of_parent
         return self._resolved
 
 
@@ -187,36 +194,23 @@ def _interpolate_rotations(known: Float, quaternions: Float, wanted: Float) -> F
     return np.asarray((before * turn).as_matrix(), np.float64)
 
 
-class Odometry:
+class Odometry(Motion):
     """The poses of one Odometry topic: of frame `child` in `frame`."""
 
     def __init__(self, topic: str) -> None:
-        self.topic = topic
-        self.frame, self.child = "", ""
-        self.stamp_ns = array("q")
-        self._tree = TransformTree()
-        self.skipped = self._tree.skipped
+        super().__init__()
+        self.topic, self.frame, self.child = topic, "", ""
+        self.skipped, self._number = SkippedRecords(), 0
 
     def add_message(self, message: Any) -> None:
         """Add the pose of a message; an invalid one is counted."""
-        pose, stamp = message.pose.pose, stamp_ns(message.header)
-        if self._tree.add_transform("odometry", "robot", stamp, pose.position, pose.orientation):
+        pose = message.pose.pose
+        self._number += 1
+        if self.add(stamp_ns(message.header), pose.position, pose.orientation):
             self.frame = frame_name(message.header.frame_id)
             self.child = frame_name(message.child_frame_id)
-            self.stamp_ns.append(stamp)
-
-    def poses_at(self, at_ns: Int64) -> Lookup:
-        """T_frame_child at times (N,)."""
-        poses = self._tree.lookup("odometry", "robot", at_ns)
-        assert poses is not None
-        return poses
-
-
-class Frames(NamedTuple):
-    """The transforms of a bag, and its Odometry topics with at least one pose."""
-
-    tree: TransformTree
-    odometry: list[Odometry]
+        else:
+            self.skipped.add(BAD_TRANSFORM, self._number)
 
 
 class Sensor(NamedTuple):
@@ -247,7 +241,7 @@ class SensorPoses(NamedTuple):
     warnings: list[str]
 
 
-def place_sensors(frames: Frames, sensors: list[Sensor], options: ReadOptions) -> SensorPoses:
+def place_sensors(tree: TransformTree, sensors: list[Sensor], options: ReadOptions) -> SensorPoses:
     """Find the base frame and the poses of sensors in it, which are in order of preference.
 
     Of topics in the same frame the first is used, and only those connected with the base.
@@ -256,12 +250,12 @@ def place_sensors(frames: Frames, sensors: list[Sensor], options: ReadOptions) -
         InputError: the options name a frame that is not there, or a topic that cannot be used.
     """
     kept, omitted = _drop_duplicates(sensors, named=options.topic is not None)
-    base, how = _find_base_frame(frames, [sensors[k].frame for k in kept], options)
+    base, how = _find_base_frame(tree, [sensors[k].frame for k in kept], options)
     used: list[int] = []
     T_base_sensor = []
     for k in kept:
         sensor = sensors[k]
-        pose = frames.tree.lookup(base, sensor.frame, sensor.stamp_ns)
+        pose = tree.lookup(base, sensor.frame, sensor.stamp_ns)
         if pose is None and options.base_frame is not None and not used:
             raise InputError(f"no transform connects {sensor.frame!r} with {base!r}")
         if pose is None and used:
@@ -301,16 +295,18 @@ def _drop_duplicates(sensors: list[Sensor], *, named: bool) -> tuple[list[int], 
     return list(used.values()), dropped
 
 
-def _find_base_frame(frames: Frames, sensors: list[str], options: ReadOptions) -> tuple[str, str]:
+def _find_base_frame(
+    tree: TransformTree, sensors: list[str], options: ReadOptions
+) -> tuple[str, str]:
     """The base frame, and how it was found."""
-    tree, given = frames.tree, options.base_frame
+    given = options.base_frame
     if given is not None:
         if given not in tree.frames and given not in sensors:
             known = ", ".join(sorted(tree.frames | set(sensors))[:20])
             raise InputError(f"base frame {given!r} is not in the recording", hint=f"has: {known}")
         return given, "given"
     path = tree.path_to_root(sensors[0])
-    for topic in frames.odometry:
+    for topic in tree.odometry.values():
         if topic.child and topic.child in path:
             return topic.child, f"{topic.topic} names it"
     for name in _BASE_NAMES:
@@ -334,7 +330,7 @@ def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
 
 
 def find_odometry(
-    frames: Frames, base: str, at_ns: Int64, options: ReadOptions, warnings: list[str]
+    tree: TransformTree, base: str, at_ns: Int64, options: ReadOptions, warnings: list[str]
 ) -> tuple[Float | None, dict[str, Any]]:
     """Odometry (T, 4, 4) at the scans, and its origin (for `source`); adds warnings.
 
@@ -343,7 +339,7 @@ def find_odometry(
     Raises:
         InputError: the options name a frame that is not there.
     """
-    (tree, odometry), frame = frames, options.odom_frame
+    odometry, frame = tree.odometry.values(), options.odom_frame
     if frame is not None and frame not in tree.frames | {o.frame for o in odometry}:
         raise InputError(f"odometry frame {frame!r} is not in the recording")
     # the nearest frame above the base in which it moves
@@ -351,30 +347,23 @@ def find_odometry(
     odom = frame or (tree.parent(moving[0]) if moving else None) or ""
     poses = tree.lookup(odom, base, at_ns) if odom in tree.frames else None
     if poses is not None and poses.moves:
-        _warn_of_gaps(poses.outside, tree.stamps_between(odom, base), at_ns, warnings)
-        return poses.T, {"from": f"TF from {odom} to {base}", "outside": poses.outside}
+        return poses.T, _describe(f"TF from {odom} to {base}", poses.outside, warnings)
     for topic in sorted(odometry, key=lambda o: -len(o.stamp_ns)):
         if frame in (None, topic.frame):
-            poses, T_child_base = topic.poses_at(at_ns), None
+            topic.sort()
+            (T, outside), T_child_base = topic.interpolate(at_ns), None
             if topic.child != base:
                 T_child_base = tree.lookup(topic.child, base, at_ns)
             if T_child_base is None and topic.child not in ("", base):
                 text = f"used as the pose of {base}, although it is of {topic.child}"
                 warnings.append(f"{topic.topic}: {text}")
-            _warn_of_gaps(poses.outside, np.asarray(topic.stamp_ns), at_ns, warnings)
-            T = poses.T if T_child_base is None else poses.T @ T_child_base.T
-            return T, {"from": topic.topic, "outside": poses.outside}
+            T = T if T_child_base is None else T @ T_child_base.T
+            return T, _describe(topic.topic, outside, warnings)
     return None, {"from": None, "outside": 0}
 
 
-def _warn_of_gaps(outside: int, stamps: Int64, at_ns: Int64, warnings: list[str]) -> None:
-    """Warn of scans at times (T,) outside odometry of these stamps, or in a gap of it."""
+def _describe(origin: str, outside: int, warnings: list[str]) -> dict[str, Any]:
+    """Notes on odometry; warns of scans outside its time."""
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
-    if not len(at_ns) or not len(stamps):
-        return
-    stamps = np.sort(stamps)
-    stamps = stamps[(stamps >= at_ns[0]) & (stamps <= at_ns[-1])]
-    gap = float(np.diff(stamps).max(initial=0)) / 1e9
-    if gap > _MAX_GAP:
-        warnings.append(f"no odometry for {gap:.1f} s: interpolated over the gap")
+    return {"from": origin, "outside": outside}
