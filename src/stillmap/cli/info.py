@@ -26,7 +26,6 @@ from typing import Any
 from stillmap.cli.arguments import JSON, OTHERS, READ, read_options
 from stillmap.cli.console import format_rows, print_lines, show_share
 from stillmap.core.errors import InputError
-from stillmap.core.json import to_jsonable
 
 # entries of the summary that its text does not show, or shows in its heading
 _HIDDEN = ("input", "format", "dimension", "skipped_unit", "records", "read_options")
@@ -51,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     for number, summary in enumerate(summaries):
         print_lines([*([""] * (number > 0)), *_format_summary(summary)])
-    print_lines(format_rows(run))
+    if run:
+        print_lines(format_rows(run))
     return 0
 
 
@@ -66,6 +66,7 @@ def _summarize(path: str, args: argparse.Namespace) -> dict[str, Any]:
 
 def _summarize_overlap(summaries: list[dict[str, Any]], args: argparse.Namespace) -> dict[str, Any]:
     """What is left out of parts of one run that overlap, as `stillmap map` joins them."""
+    from stillmap.core.json import to_jsonable
     from stillmap.pipeline import inputs
 
     times = [summary["time"] for summary in summaries if summary["time"]]
