@@ -1,73 +1,35 @@
 """The E-step: labels of beams, the occupancy map and the likelihood. No I/O."""
 
-from stillmap.em.beam_counting import beam_boxes, count_in_window
-from stillmap.em.change_hmm import CellHistories
-from stillmap.em.estimator import (
-    ESTIMATORS_3D,
-    Estimator,
-    add_recording,
-    add_trusted_beams,
-    changed_share,
-    e_step,
-    fixed_iterations,
-    initial_p_static,
-    make_grid,
-    max_iterations,
-    needs_counts,
-    recount_as_static,
-    touched_share,
-)
-from stillmap.em.final_labels import final_e_step
-from stillmap.em.ground import estimate_ground
-from stillmap.em.occupancy_grid import (
-    GridWindow,
-    OccupancyMap,
-    find_hits_beyond,
-    make_occupancy_map,
-)
-from stillmap.em.options import EmOptions, MapState
-from stillmap.em.quality import Coverage, count_observations, score_held_out_scans
-from stillmap.em.types import (
-    CellProbabilities,
-    ChangedCells,
-    EStepResult,
-    Grid,
-    GroundMap,
-    Likelihood,
-)
-
-__all__ = [
-    "ESTIMATORS_3D",
-    "CellHistories",
-    "CellProbabilities",
-    "ChangedCells",
-    "Coverage",
-    "EStepResult",
-    "EmOptions",
-    "Estimator",
-    "Grid",
-    "GridWindow",
-    "GroundMap",
-    "Likelihood",
-    "MapState",
-    "OccupancyMap",
-    "add_recording",
-    "add_trusted_beams",
-    "beam_boxes",
-    "changed_share",
-    "count_in_window",
-    "count_observations",
-    "e_step",
-    "estimate_ground",
-    "final_e_step",
-    "find_hits_beyond",
-    "fixed_iterations",
-    "initial_p_static",
-    "make_grid",
-    "make_occupancy_map",
-    "max_iterations",
-    "needs_counts",
-    "recount_as_static",
-    "score_held_out_scans",
-    "touched_share",
-]
+from stillmap.em.beam_counting import beam_boxes as beam_boxes
+from stillmap.em.beam_counting import count_in_window as count_in_window
+from stillmap.em.change_hmm import CellHistories as CellHistories
+from stillmap.em.estimator import ESTIMATORS_3D as ESTIMATORS_3D
+from stillmap.em.estimator import Estimator as Estimator
+from stillmap.em.estimator import add_recording as add_recording
+from stillmap.em.estimator import add_trusted_beams as add_trusted_beams
+from stillmap.em.estimator import changed_share as changed_share
+from stillmap.em.estimator import e_step as e_step
+from stillmap.em.estimator import fixed_iterations as fixed_iterations
+from stillmap.em.estimator import initial_p_static as initial_p_static
+from stillmap.em.estimator import make_grid as make_grid
+from stillmap.em.estimator import max_iterations as max_iterations
+from stillmap.em.estimator import needs_counts as needs_counts
+from stillmap.em.estimator import recount_as_static as recount_as_static
+from stillmap.em.estimator import touched_share as touched_share
+from stillmap.em.final_labels import final_e_step as final_e_step
+from stillmap.em.ground import estimate_ground as estimate_ground
+from stillmap.em.occupancy_grid import GridWindow as GridWindow
+from stillmap.em.occupancy_grid import OccupancyMap as OccupancyMap
+from stillmap.em.occupancy_grid import find_hits_beyond as find_hits_beyond
+from stillmap.em.occupancy_grid import make_occupancy_map as make_occupancy_map
+from stillmap.em.options import EmOptions as EmOptions
+from stillmap.em.options import MapState as MapState
+from stillmap.em.quality import Coverage as Coverage
+from stillmap.em.quality import count_observations as count_observations
+from stillmap.em.quality import score_held_out_scans as score_held_out_scans
+from stillmap.em.types import CellProbabilities as CellProbabilities
+from stillmap.em.types import ChangedCells as ChangedCells
+from stillmap.em.types import EStepResult as EStepResult
+from stillmap.em.types import Grid as Grid
+from stillmap.em.types import GroundMap as GroundMap
+from stillmap.em.types import Likelihood as Likelihood
