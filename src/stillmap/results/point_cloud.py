@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ FIELDS: Fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 COLOURS: Fields = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 PACKED_COLOUR: Fields = [("rgb", "<u4")]  # 0x00RRGGBB, of PCD
 _TYPES = {"<f4": "float", "<f8": "double", "u1": "uchar"}
-_VERTICES = 1 << 16  # vertices in memory
+MAX_BLOCK = 1 << 16  # points in memory
 
 
 class Block(NamedTuple):
@@ -44,14 +44,6 @@ class Block(NamedTuple):
     p_static: NDArray[np.float32]
     stamp_ns: NDArray[np.int64] | None
     colors: NDArray[np.uint8] | None = None
-
-    def split(self, size: int) -> "Iterator[Block]":
-        """Blocks of at most `size` points."""
-        for first in range(0, len(self.points), size):
-            part = slice(first, first + size)
-            stamp_ns = None if self.stamp_ns is None else self.stamp_ns[part]
-            colors = None if self.colors is None else self.colors[part]
-            yield Block(self.points[part], self.p_static[part], stamp_ns, colors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +70,17 @@ class Cloud:
         return bool(np.abs(self.origin).max() > FAR)
 
     def iter_blocks(self, progress: Callable[[float], None] | None = None) -> Iterator[Block]:
-        """The blocks; `progress` is called with the share of the points that is done."""
+        """The points in blocks of at most `MAX_BLOCK`; `progress` is called with the share of them
+        that is done."""
         done = 0
         for block in self.make_blocks():
-            yield block
-            done += len(block.points)
-            if progress is not None:
-                progress(done / max(self.count, 1))
+            for first in range(0, len(block.points), MAX_BLOCK):
+                part = slice(first, first + MAX_BLOCK)
+                columns: list[Any] = [None if one is None else one[part] for one in block]
+                yield Block(*columns)
+                done += len(columns[0])
+                if progress is not None:
+                    progress(done / self.count)
 
     def sample(self, max_count: int) -> Block:
         """At most `max_count` of the points, evenly over their order, without times."""
@@ -250,11 +246,10 @@ def write_clouds(
         static.write(ply_header(fields, cloud.count - dynamic))
         moving.write(ply_header(fields, dynamic))
         for block in cloud.iter_blocks():
-            for part in block.split(_VERTICES):
-                vertices = make_vertices(part, fields)
-                moves = vertices["p_static"] < DYNAMIC_BELOW
-                static.write(vertices[~moves].tobytes())
-                moving.write(vertices[moves].tobytes())
+            vertices = make_vertices(block, fields)
+            moves = vertices["p_static"] < DYNAMIC_BELOW
+            static.write(vertices[~moves].tobytes())
+            moving.write(vertices[moves].tobytes())
 
 
 def append_vertices(path: Path, block: Block) -> None:
@@ -269,8 +264,7 @@ def append_vertices(path: Path, block: Block) -> None:
         file.write(ply_header(fields, layout.rows + len(block.points)))
         before.seek(layout.start)
         shutil.copyfileobj(before, file)
-        for part in block.split(_VERTICES):
-            file.write(make_vertices(part, fields).tobytes())
+        file.write(make_vertices(block, fields).tobytes())
     whole.replace(path)
 
 

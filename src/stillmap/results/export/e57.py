@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
 from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE
-from stillmap.results.point_cloud import Cloud
+from stillmap.results.point_cloud import MAX_BLOCK, Cloud
 
-_BLOCK = 1 << 16  # points written at a time
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 
@@ -70,9 +70,9 @@ def _write_scan(
     columns["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
     if cloud.has_colors:
         columns |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLORS}
-    values, buffers = [np.zeros(_BLOCK) for _ in columns], library.VectorSourceDestBuffer()
+    values, buffers = [np.zeros(MAX_BLOCK) for _ in columns], library.VectorSourceDestBuffer()
     for name, one in zip(columns, values, strict=True):
-        buffers.append(library.SourceDestBuffer(file, name, one, _BLOCK, True, True))
+        buffers.append(library.SourceDestBuffer(file, name, one, MAX_BLOCK, True, True))
     prototype = _fill(library, file, library.StructureNode(file), columns)
     points = library.CompressedVectorNode(file, prototype, library.VectorNode(file, True))
     root, scans, scan = file.root(), library.VectorNode(file, True), library.StructureNode(file)
@@ -89,30 +89,37 @@ def _write_scan(
     _fill(library, file, root, header)
     scans.append(scan)
     _fill(library, file, scan, {**_describe_scan(cloud), "points": points})
-    digest, low, high = hashlib.sha256(), np.full(3, np.inf), np.full(3, -np.inf)
     with closing(points.writer(buffers)) as writer:
-        for block in cloud.iter_blocks(progress):
-            for part in block.split(_BLOCK):
-                if np.abs(part.points - cloud.origin).max() >= MAX_INTEGER * SCALE:
-                    what = "cannot be written: a point is beyond the range of E57 coordinates"
-                    raise InputError(what)
-                low = np.minimum(low, part.points.min(axis=0))
-                high = np.maximum(high, part.points.max(axis=0))
-                colors = () if part.colors is None else part.colors.T
-                for one, column in zip(
-                    values, [*part.points.T, part.p_static, *colors], strict=True
-                ):
-                    one[: len(column)] = column
-                    digest.update(one[: len(column)].data)
-                writer.write(len(part.points))
+        digest, low, high = _write_points(writer, values, cloud, progress)
     if cloud.count:
         ends = {f"{axis}Minimum": at for axis, at in zip("xyz", low.tolist(), strict=True)}
         ends |= {f"{axis}Maximum": at for axis, at in zip("xyz", high.tolist(), strict=True)}
         _fill(library, file, scan, {"cartesianBounds": ends})
     # derived from the points, so that the file is reproducible
     for node, name in ((root, "file"), (scan, "scan")):
-        guid = uuid.uuid5(uuid.NAMESPACE_URL, f"{name} {digest.hexdigest()}")
+        guid = uuid.uuid5(uuid.NAMESPACE_URL, f"{name} {digest}")
         node.set("guid", library.StringNode(file, f"{{{guid}}}"))
+
+
+def _write_points(
+    writer: Any,
+    values: list[Float],
+    cloud: Cloud,
+    progress: Callable[[float], None] | None,
+) -> tuple[str, Float, Float]:
+    """Write all points through the buffers `values`; their digest, and their bounds (3,), (3,)."""
+    digest, low, high = hashlib.sha256(), np.full(3, np.inf), np.full(3, -np.inf)
+    for block in cloud.iter_blocks(progress):
+        if np.abs(block.points - cloud.origin).max() >= MAX_INTEGER * SCALE:
+            raise InputError("cannot be written: a point is beyond the range of E57 coordinates")
+        low = np.minimum(low, block.points.min(axis=0))
+        high = np.maximum(high, block.points.max(axis=0))
+        colors = () if block.colors is None else block.colors.T
+        for one, column in zip(values, [*block.points.T, block.p_static, *colors], strict=True):
+            one[: len(column)] = column
+            digest.update(one[: len(column)].data)
+        writer.write(len(block.points))
+    return digest.hexdigest(), low, high
 
 
 def _describe_scan(cloud: Cloud) -> dict[str, Any]:

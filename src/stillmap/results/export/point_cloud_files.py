@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
@@ -28,7 +27,6 @@ Progress = Callable[[float], None]
 
 _POINT_FORMAT, _COLOR_POINT_FORMAT = 6, 7  # of LAS: with time, and with color too
 _COLOR_SCALE = 256  # LAS has 16-bit colors
-_LINES = 1 << 14  # of text formatted at a time
 
 
 class Format(NamedTuple):
@@ -132,15 +130,9 @@ def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) ->
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")
         for block in cloud.iter_blocks(progress):
-            for part in block.split(_LINES):
-                values: list[NDArray[Any]] = [
-                    part.points,
-                    part.p_static[:, None].astype(np.float64),
-                ]
-                if part.colors is not None:
-                    values.append(part.colors)
-                rows = np.concatenate(values, axis=1)
-                file.write(line * len(rows) % tuple(rows.ravel().tolist()))
+            colors = np.zeros((len(block.points), 0)) if block.colors is None else block.colors
+            rows = np.column_stack([block.points, block.p_static.astype(np.float64), colors])
+            file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
 
 def _write_las(cloud: Cloud, path: Path, compressed: bool, progress: Progress | None) -> None:
