@@ -13,13 +13,13 @@ from stillmap.core.grid_map import Region, is_inside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.mover_colors import PointColors, assign_object_views, color_points, times_in_view
+from stillmap.mesh.mover_colors import assign_object_views, color_points, times_in_view
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.place import Background, ViewAssignment, assign_views
 from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
 from stillmap.mesh.returns import DynamicReturns, ObjectTrack, collect_tracks, merge_tracks
 from stillmap.mesh.texture import TexturedMesh, bake_texture
-from stillmap.mesh.triangle_mesh import Mesh, Tell
+from stillmap.mesh.triangle_mesh import Image, Mesh, Tell
 from stillmap.mesh.tsdf import build_surface
 from stillmap.mesh.view_selection import read_with_gains
 from stillmap.mesh.views import UNREADABLE, View, filter_readable, find_views
@@ -64,7 +64,7 @@ class Models(ShortRepr):
         unread: one line for each image that could not be read.
         objects: models of moving objects, in the order of the objects.
         n_objects: number of moving objects.
-        point_colors: colors of the end points; None without images.
+        point_colors: (M, 3) of the end points, see `color_points`; None without images.
         origin: (3,) metres in the map frame, the origin of the frame that all this is in.
     """
 
@@ -75,7 +75,7 @@ class Models(ShortRepr):
     unread: list[str]
     objects: list[ObjectModel]
     n_objects: int
-    point_colors: PointColors | None = None
+    point_colors: Image | None = None
     origin: Float = field(default_factory=lambda: np.zeros(3))
 
 

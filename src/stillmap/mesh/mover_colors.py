@@ -2,7 +2,7 @@
 colors of all end points, static ones from the textured surface."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -12,7 +12,6 @@ from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import is_in_image, project
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
-from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import (
     OUTLINE_MARGIN,
@@ -168,28 +167,14 @@ _POINT_RADIUS = 0.12  # m around each point that an object covers
 _POINTS_PER_BLOCK = 1 << 16
 
 
-@dataclass(frozen=True, eq=False)
-class PointColors(ShortRepr):
-    """Colors of the end points of M beams.
-
-    Attributes:
-        colors: (M, 3) uint8, sRGB; GRAY where unknown, and only there.
-        counts: numbers of hits, `static` and `dynamic`, and how many of them have a color:
-            `static_coloured`, `dynamic_coloured`.
-    """
-
-    colors: Image
-    counts: dict[str, int]
-
-
 def color_points(
     textured: TexturedMesh,
     background: Background,
     returns: DynamicReturns,
     threads: int = 1,
     tell: Tell = no_tell,
-) -> PointColors:
-    """Colors the end points of all beams.
+) -> Image:
+    """(M, 3) sRGB colors of the end points of all beams; GRAY where unknown, and only there.
 
     Dynamic points without a track have no color.
 
@@ -216,17 +201,6 @@ def color_points(
         color_moving(out, delay, tracked, number, background)
         inputs.deskewed.release_pages(inputs.p_static, out, delay)
         tell(scans + number + 1, n)
-    return PointColors(out, _count_colored_returns(out, inputs))
-
-
-def _count_colored_returns(colors: Image, inputs: MeshInputs) -> dict[str, int]:
-    hit, p_static = inputs.deskewed.hit, inputs.p_static
-    out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
-    for block in arrays.iter_blocks(hit, p_static, colors):
-        has, static = (colors[block] != GRAY).any(axis=1), p_static[block] >= DYNAMIC_BELOW
-        for name, part in (("static", hit[block] & static), ("dynamic", hit[block] & ~static)):
-            out[name] += int(np.count_nonzero(part))
-            out[f"{name}_coloured"] += int(np.count_nonzero(part & has))
     return out
 
 

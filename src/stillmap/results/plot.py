@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from stillmap.core.errors import InputError, import_extra
+from stillmap.core.errors import import_extra
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.results.colors import KIND_COLORS
 from stillmap.results.mapped_place import MappedPlace
@@ -33,7 +33,8 @@ def plot_result(
 ) -> "Axes":
     """See `Result.plot`; dynamic returns are those of the sessions `moving`."""
     if ax is None:
-        ax = _make_axes()
+        pyplot = import_extra("matplotlib.pyplot", "a plot", "drawn", group="notebook")
+        ax = pyplot.subplots(layout="constrained")[1]
     view = MapView.of([result.map])
     image, (x0, y0, x1, y1) = draw_map(result.map, view.window), view.window
     # pixels are whole squares of cells: the last ones may reach beyond the window
@@ -58,23 +59,6 @@ def plot_result(
     ax.set_xlabel("x (m)")
     ax.set_ylabel("y (m)")
     return ax
-
-
-def _make_axes() -> "Axes":
-    """New axes of pyplot.
-
-    Raises:
-        MissingExtra: matplotlib is not installed.
-        InputError: the backend that `MPLBACKEND` names is missing.
-    """
-    try:
-        pyplot = import_extra("matplotlib.pyplot", "a plot", "drawn", group="notebook")
-        axes: Axes = pyplot.subplots(layout="constrained")[1]
-    except (ImportError, ValueError) as error:
-        raise InputError(
-            f"no plot can be drawn: {error}", hint="MPLBACKEND=agg needs no screen, or give ax"
-        ) from error
-    return axes
 
 
 def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:

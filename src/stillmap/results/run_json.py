@@ -133,7 +133,6 @@ def models_record(models: "Models") -> dict[str, Any]:
     def area(of: NDArray[np.bool_]) -> float:
         return round(float(areas[of].sum()), 4)
 
-    points = {} if models.point_colors is None else {"points": dict(models.point_colors.counts)}
     used = {view.image for k, view in enumerate(models.views) if (place.view == k).any()}
     return {
         "faces": len(areas),
@@ -148,7 +147,6 @@ def models_record(models: "Models") -> dict[str, Any]:
         },
         "pages": [list(page.shape[:2]) for page in models.textured.pages],
         "objects": {"found": models.n_objects, "modelled": len(models.objects)},
-        **points,
     }
 
 

@@ -62,7 +62,7 @@ def save(
             outside the map.
     """
     result, region = crop_result(result), result.options.output.region
-    colors = None if models is None or models.point_colors is None else models.point_colors.colors
+    colors = None if models is None else models.point_colors
     with atomic_folder(path, marker, overwrite) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
