@@ -207,28 +207,34 @@ def subdivide(mesh: Mesh, max_edge: float | Callable[[Float], Float]) -> tuple[M
         The mesh, its first vertices those of the old one, and the old face (F',) of each face.
     """
     vertices, faces, of = mesh.vertices, mesh.faces, np.arange(len(mesh.faces))
-    limit = _edge_limits(max_edge, vertices)
+    limit, done = _edge_limits(max_edge, vertices), [(faces[:0], of[:0])]
     for _ in range(_SUBDIVISION_ROUNDS):
         ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
         key, edge = np.unique(ends @ [len(vertices), 1], return_inverse=True)
         edge, (a, b) = edge.reshape(-1, 3), np.divmod(key, max(len(vertices), 1))
         length = row_lengths(vertices[a] - vertices[b])
         long = length > np.minimum(limit[a], limit[b])
-        if not long.any():
+        rest = long[edge].any(axis=1)
+        done.append((faces[~rest], of[~rest]))
+        faces, of, edge = faces[rest], of[rest], edge[rest]
+        if not len(faces):
             break
         rank = np.empty(len(key), np.intp)
         rank[np.lexsort((length, long))] = np.arange(len(key))
         first = np.argmax(rank[edge], axis=1)
         across = edge[np.arange(len(edge)), first]
-        halved = long & (np.bincount(across, minlength=len(key)) == np.bincount(edge.ravel()))
+        count, every = (np.bincount(some, minlength=len(key)) for some in (across, edge.ravel()))
+        halved = long & (count == every)
         middle = len(vertices) + np.cumsum(halved) - 1
         points = 0.5 * (vertices[a[halved]] + vertices[b[halved]])
-        vertices, limit = (
-            np.concatenate([vertices, points]),
-            np.concatenate([limit, _edge_limits(max_edge, points)]),
-        )
+        vertices = np.concatenate([vertices, points])
+        limit = np.concatenate([limit, _edge_limits(max_edge, points)])
         faces, of = _halve_faces(faces, of, halved[across], first, middle[across])
-    return Mesh(vertices, faces), of
+    parts, owners = zip(*done, (faces, of), strict=True)
+    owner = np.concatenate(owners)
+    # parts of a face side by side, in the order of the faces
+    order = np.argsort(owner, kind="stable")
+    return Mesh(vertices, np.concatenate(parts)[order]), owner[order]
 
 
 def _edge_limits(max_edge: float | Callable[[Float], Float], points: Float) -> Float:
@@ -243,7 +249,4 @@ def _halve_faces(
     a, b, c = np.take_along_axis(faces[halved], turn, axis=1).T
     m = middle[halved].astype(np.int32)
     parts = [faces[~halved], np.stack([a, m, c], axis=1), np.stack([m, b, c], axis=1)]
-    # parts of a face side by side, in the order of the faces
-    owner = np.concatenate([of[~halved], of[halved], of[halved]])
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate(parts)[order], owner[order]
+    return np.concatenate(parts), np.concatenate([of[~halved], of[halved], of[halved]])
