@@ -21,10 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.timestamps import are_dated
-
-Float = NDArray[np.float64]
 
 Mask = NDArray[np.bool_]
 

@@ -27,6 +27,7 @@ _NO_RENAME = (errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES, errno.EROFS)
 _MAX_STEM = 100  # bytes of a name to which something is added
 _RANDOM = re.compile(r"[0-9a-f]{16}\.(part|old)")
 _MAX_AGE = 86_400.0  # s without a change after which work is that of a process that was killed
+_OVERWRITE = "choose another or give overwrite=True"
 _OF_DISKS = "lost+found"  # in the uppermost folder of a disk
 
 
@@ -103,9 +104,7 @@ def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
     if not _list_entries(target):
         return
     if not overwrite:
-        raise InputError(
-            "already holds something", where=str(path), hint="choose another or give overwrite=True"
-        )
+        raise InputError("already holds something", where=str(path), hint=_OVERWRITE)
     if not any(target.glob(marker)) and not any(target.glob(f"{PREFIX}*.part")):
         what = f"holds other things: only a folder with {marker} is replaced"
         raise InputError(what, where=str(path), hint="choose another")
@@ -118,19 +117,12 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
         InputError: the path exists and may not be replaced, or its folder does not exist.
     """
     target = resolve_output(path)
-    if target.is_dir():
-        raise InputError("is in the way: a folder", where=str(path))
     if target.exists() and not target.is_file():
         raise InputError("is in the way: no regular file", where=str(path))
     if target.exists() and not overwrite:
-        raise InputError(
-            "is there already", where=str(path), hint="choose another or give overwrite=True"
-        )
-    if target.parent.is_dir():
-        return
-    if target.parent.exists():
-        raise InputError("cannot be written: Not a directory", where=str(path))
-    raise InputError("cannot be written: no such folder", where=str(path.parent))
+        raise InputError("is there already", where=str(path), hint=_OVERWRITE)
+    if not target.parent.is_dir():
+        raise InputError("cannot be written: no such folder", where=str(path.parent))
 
 
 @contextmanager

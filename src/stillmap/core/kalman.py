@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from stillmap.core.array_types import Float
 
 SPEED_STD = 1.0  # m/s, of a new track: people walk
 

@@ -1,9 +1,9 @@
 """SE(2): poses in the plane as homogeneous matrices, vectorized over leading axes."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from stillmap.core.array_types import Float
 
 
 def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:

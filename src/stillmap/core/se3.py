@@ -4,9 +4,8 @@ A twist is (linear, angular velocity) in the moving frame. `se2.inverse` holds i
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from stillmap.core.array_types import Float
 
 _SMALL = 1e-6  # rad, below which the series are exact
 

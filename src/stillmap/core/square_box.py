@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Index = NDArray[np.intp]
-
+from stillmap.core.array_types import Index
 
 # up to so many cells or nodes NumPy alone is faster than loading SciPy, which takes 0.3 s
 _FEW_CELLS, _FEW_NODES = 300, 10_000

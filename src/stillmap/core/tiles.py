@@ -13,6 +13,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Index
 
 TILE = 256  # cells, edge of a tile
 # of a layer: a map has ten of them, and buildings leave most of the box around them empty
@@ -21,7 +22,6 @@ _BYTES_IN_MEMORY = 4 << 20  # of the tiles of a layer that as a whole is too lar
 TILES_PER_RELEASE = 16  # that are used between two releases of pages
 _TILES_PER_FILE = 256  # that share a memory-mapped file: 64 MB of float32
 
-Index = NDArray[np.intp]
 Block = tuple[slice, slice]  # rows and columns
 
 

@@ -5,7 +5,6 @@ import logging
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -235,7 +234,6 @@ def iterate(
     poses: Float | None = None,
     progress: Progress = no_progress,
     stages: StageTimer | None = None,
-    scratch: Path | None = None,
     previous: Estimate | None = None,
 ) -> Iterator[Iteration]:
     """Alternates the M-step and the E-step; the caller decides when to stop.
@@ -246,8 +244,6 @@ def iterate(
         poses: (T, D+1, D+1) T_map_base to keep instead of estimating them; near the origin.
         progress: called with the stage, the iteration, scans done, and of how many.
         stages: where time and memory per stage are noted.
-        scratch: folder for per-beam arrays too large for memory, in anonymous files that the
-            process's end deletes. None: the system's temporary folder.
         previous: estimate of an earlier iteration with the same arguments, to continue from.
 
     Yields:
@@ -260,8 +256,6 @@ def iterate(
     if poses is not None and poses.shape != (recording.n_scans, D + 1, D + 1):
         wanted = (recording.n_scans, D + 1, D + 1)
         raise ValueError(f"poses: expected {wanted}, got {poses.shape}")
-    if scratch is not None:
-        recording = dataclasses.replace(recording, scratch=scratch)
     stages, options = stages or StageTimer(), resolve_options(options, recording)
     first = 1 if previous is None else previous.number + 1
     for number in range(first, em.max_iterations(options.estimator, options.em) + 1):

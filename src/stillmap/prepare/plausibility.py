@@ -95,14 +95,13 @@ def leave_out_far_returns(
         with np.errstate(invalid="ignore"):  # infinite ones become NaN
             points[free] = (points[free] * (limit / length)).astype(np.float32)
     if not len(returns):
-        beams = f"{len(free)} beam{'s' * (len(free) > 1)} without a return"
-        where = f"beyond {reach:.4g} m, where nothing is mapped"
-        return kept, [f"{beams} would show free space {where}: shortened"]
-    cells = "slam.resolution" if recording.dimension == 2 else "slam.voxel_size"
-    option = "read.max_range" if reach < MAX_PLAUSIBLE_RANGE else f"a coarser {cells}"
+        return kept, []
     total = int(np.count_nonzero(recording.hit))
     what = f"{len(returns)} of {total} returns are farther than {reach:.4g} m: they are not used"
-    return kept, [advise(what, f"if the sensor reaches that far, say so by {option}")]
+    todo = "if the sensor reaches that far, say so by read.max_range"
+    if reach >= MAX_PLAUSIBLE_RANGE:
+        todo = "a coarser slam.voxel_size, in 2D slam.resolution, maps them"
+    return kept, [advise(what, todo)]
 
 
 def shorten_far_beams(points: Float32, hit: Bool, reach: float) -> tuple[Float32, Bool]:

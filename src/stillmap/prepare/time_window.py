@@ -9,7 +9,7 @@ from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import Part
-from stillmap.core.timestamps import format_seconds
+from stillmap.core.timestamps import MAX_STAMP_NS, format_seconds
 from stillmap.prepare.options import ReadOptions
 
 ABSOLUTE = 1e8  # s: times from here on are stamps; no recording lasts three years
@@ -28,15 +28,13 @@ class TimeWindow:
         origin_ns: stamp from which times count; None: that of the first scan.
 
     Attributes:
-        first_ns, last_ns: smallest and largest stamp of all scans so far; None: there was none.
-        omitted: number of scans outside the window.
+        selected, omitted: numbers of scans inside and outside the window so far.
     """
 
     def __init__(self, options: ReadOptions, origin_ns: int | None = None) -> None:
         self._start, self._end = options.start or None, options.end
         self._origin_ns = origin_ns
-        self.first_ns: int | None = None
-        self.last_ns: int | None = None
+        self._span_ns: tuple[int, int] | None = None  # of all scans so far
         self.selected = self.omitted = 0
 
     def __bool__(self) -> bool:
@@ -47,8 +45,8 @@ class TimeWindow:
         """True if a scan is to be read; counts it."""
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
-        self.first_ns = stamp_ns if self.first_ns is None else min(self.first_ns, stamp_ns)
-        self.last_ns = stamp_ns if self.last_ns is None else max(self.last_ns, stamp_ns)
+        first, last = self._span_ns or (stamp_ns, stamp_ns)
+        self._span_ns = min(first, stamp_ns), max(last, stamp_ns)
         inside = self.contains(stamp_ns)
         self.selected += inside
         self.omitted += not inside
@@ -62,10 +60,8 @@ class TimeWindow:
 
     def contains(self, stamp_ns: int) -> bool:
         """True if something with a stamp, an image say, lies inside; not counted."""
-        start, end = self._limit_ns(self._start), self._limit_ns(self._end)
-        return (start is None or stamp_ns >= start - _ROUNDING) and (
-            end is None or stamp_ns <= end + _ROUNDING
-        )
+        start, end = self._limit_ns(self._start, -1), self._limit_ns(self._end, 1)
+        return start - _ROUNDING <= stamp_ns <= end + _ROUNDING
 
     def select_images(self, images: Images | None) -> Images | None:
         """The images inside the window; None where there are none."""
@@ -81,12 +77,12 @@ class TimeWindow:
             lambda image: images.load(inside[image]),
         )
 
-    def _limit_ns(self, seconds: float | None) -> int | None:
-        if seconds is None:
-            return None
-        if seconds >= ABSOLUTE:
+    def _limit_ns(self, seconds: float | None, side: int) -> int:
+        if seconds is not None and seconds >= ABSOLUTE:
             return round(seconds * 1e9)
-        return None if self._origin_ns is None else self._origin_ns + round(seconds * 1e9)
+        if seconds is None or self._origin_ns is None:
+            return side * 2 * MAX_STAMP_NS
+        return self._origin_ns + round(seconds * 1e9)
 
     def require_scans(self, where: str = "") -> None:
         """Refuse a window that leaves nothing of a recording.
@@ -94,25 +90,21 @@ class TimeWindow:
         Raises:
             InputError: there were scans, all of them outside.
         """
-        if not self.omitted or self.selected:
+        if self.selected or self._span_ns is None:
             return
-        assert self.first_ns is not None
-        assert self.last_ns is not None
         limits = (("from", self._start), ("to", self._end))
         wanted = [f"{word} {at:.10g} s" for word, at in limits if at is not None]
-        first, last = format_seconds(self.first_ns), format_seconds(self.last_ns)
-        span = (self.last_ns - self.first_ns) / 1e9
+        first, last = map(format_seconds, self._span_ns)
+        span = (self._span_ns[1] - self._span_ns[0]) / 1e9
         hint = f"the recording spans 0 to {span:.2f} s, stamps {first} to {last}"
         raise InputError(f"has no scan {' '.join(wanted)}", where=where, hint=hint)
 
     @property
     def part(self) -> Part | None:
         """The part that was read, as `Recording.source` notes it; None without limits."""
-        if not self or self.first_ns is None:
+        if not self or self._span_ns is None:
             return None
-        return Part(
-            self.first_ns, self.last_ns, omitted=self.omitted, start=self._start, end=self._end
-        )
+        return Part(*self._span_ns, omitted=self.omitted, start=self._start, end=self._end)
 
 
 def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Recording:

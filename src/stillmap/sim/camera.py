@@ -23,25 +23,19 @@ _TILE, _CHIP, _STRIPE = 0.55, 0.17, 0.09  # m
 _FLOOR = 0.07  # m, height of skirtings
 _CHIPS, _STRIPES, _DRIFT = 0.10, 0.05, 0.08  # relative contrast
 
-# red, green, blue of 255
-_WALLS = np.array([
-    (214, 203, 178), (196, 178, 150), (222, 214, 200), (176, 186, 190), (156, 172, 160),
-    (206, 184, 160), (188, 160, 140), (170, 180, 204), (220, 196, 170), (150, 160, 178),
-    (198, 206, 188), (184, 150, 132), (226, 220, 190), (166, 150, 160), (140, 158, 150),
-    (204, 170, 150),
-], float)  # fmt: skip
-_FLOORS = np.array([
-    (120, 112, 104), (104, 100, 98), (134, 122, 106), (98, 104, 110), (140, 130, 120),
-    (112, 98, 88), (126, 120, 118), (92, 94, 96),
-], float)  # fmt: skip
-_CLOTHES = np.array([
-    (208, 30, 40), (24, 96, 200), (240, 190, 0), (20, 150, 70), (150, 40, 170), (240, 110, 10),
-    (10, 160, 170), (230, 60, 140), (40, 40, 60), (240, 240, 236),
-], float)  # fmt: skip
-_CARS = np.array([
-    (190, 20, 30), (30, 70, 160), (230, 230, 232), (60, 64, 70), (240, 196, 30), (20, 110, 80),
-    (150, 160, 170), (120, 50, 110),
-], float)  # fmt: skip
+
+def _palette(colors: str) -> Float:
+    """(n, 3) red, green and blue of 255, of colors in hexadecimal digits."""
+    return np.array([[*bytes.fromhex(color)] for color in colors.split()], float)
+
+
+_WALLS = _palette(
+    "d6cbb2 c4b296 ded6c8 b0babe 9caca0 ceb8a0 bca08c aab4cc dcc4aa 96a0b2 c6cebc b89684 "
+    "e2dcbe a696a0 8c9e96 ccaa96"
+)
+_FLOORS = _palette("787068 686462 867a6a 62686e 8c8278 706258 7e7876 5c5e60")
+_CLOTHES = _palette("d01e28 1860c8 f0be00 149646 9628aa f06e0a 0aa0aa e63c8c 28283c f0f0ec")
+_CARS = _palette("be141e 1e46a0 e6e6e8 3c4046 f0c41e 146e50 96a0aa 78326e")
 _GLASS, _TYRE, _RIM = (40, 56, 70), (28, 28, 30), (170, 172, 176)
 _SKIN, _HAIR, _SHOE = (222, 172, 140), (70, 46, 30), (40, 34, 30)
 _ZENITH, _HORIZON = np.array((120, 170, 232.0)), np.array((206, 226, 244.0))
