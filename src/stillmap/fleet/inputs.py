@@ -3,14 +3,17 @@
 import csv
 import hashlib
 import io
-import json
+import itertools
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+from msgspec import Meta
 
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.input_files import read_text
@@ -119,15 +122,15 @@ def fetch(url: str, folder: Path) -> Path:
     return folder / name
 
 
-def hash_content(url: str) -> tuple[str, int]:
-    """A digest of the names and contents of the files of a recording, and their bytes.
+def hash_content(url: str) -> str:
+    """A digest of the names and contents of the files of a recording.
 
     At a URL the ETags, or what else the storage knows of a version, stand for the contents.
 
     Raises:
         InputError: it cannot be read.
     """
-    fs, whole, size = open_location(url)[0], hashlib.sha256(), 0
+    fs, whole = open_location(url)[0], hashlib.sha256()
     for name, about in list_files(url).items():
         with explain(url, "read"):
             if is_local(url):
@@ -136,8 +139,7 @@ def hash_content(url: str) -> tuple[str, int]:
             else:
                 version = about.get("ETag") or fs.ukey(about["name"])
         whole.update(repr((name, version)).encode())
-        size += about["size"]
-    return whole.hexdigest(), size
+    return whole.hexdigest()
 
 
 def is_component(name: str) -> bool:
@@ -157,12 +159,17 @@ class Entry(NamedTuple):
     Attributes:
         input: absolute path, or URL.
         place: name of the place it is merged into; None: it is not merged.
-        where: the manifest and its line; empty: from the command line.
+        where: the manifest and the number of the entry; empty: from the command line.
     """
 
     input: str
     place: str | None
     where: str = ""
+
+
+class _Row(msgspec.Struct, forbid_unknown_fields=True):
+    input: Annotated[str, Meta(pattern=r"\S")]
+    place: str | None = None
 
 
 class Source(NamedTuple):
@@ -182,60 +189,41 @@ def read_manifest(location: str) -> list[Entry]:
             file with a list of objects with these keys.
 
     Raises:
-        InputError: names the line, or in JSON the number of the entry.
+        InputError: names the number of the entry.
     """
     fs, path = open_location(location)
-    try:
+    with explain(location, "read"):
         if is_local(location):
             text = read_text(Path(path), _MAX_MANIFEST)
         else:
-            with explain(location, "read"):
-                text = fs.cat_file(path, end=_MAX_MANIFEST).decode()
-    except UnicodeDecodeError as error:
-        raise InputError("is not UTF-8", where=location) from error
-    rows = _read_json if location.lower().endswith(".json") else _read_csv
-    folder = absolute(location).rpartition("/")[0]
-    entries = [_entry(folder, row, where) for row, where in rows(location, text)]
-    if not entries:
+            text = fs.cat_file(path, end=_MAX_MANIFEST).decode()
+    try:
+        if location.lower().endswith(".json"):
+            rows = msgspec.json.decode(text, type=list[Any])
+        else:
+            lines = io.StringIO(text.removeprefix("\ufeff"), newline="")
+            rows = list(csv.DictReader(lines, strict=True))
+    except (csv.Error, msgspec.DecodeError, RecursionError) as error:
+        raise InputError(f"is no list of recordings: {error}", where=location) from error
+    if not rows:
         raise InputError("names no recording", where=location)
-    return entries
+    folder = absolute(location).rpartition("/")[0]
+    return [_entry(folder, row, f"{location}: entry {k}") for k, row in enumerate(rows, 1)]
 
 
-def _read_csv(location: str, text: str) -> Iterator[tuple[Any, str]]:
-    reader = csv.DictReader(io.StringIO(text.removeprefix("\ufeff"), newline=""), strict=True)
+def _entry(folder: str, content: Any, where: str) -> Entry:
     try:
-        for row in reader:
-            where = f"{location}:{reader.line_num}"
-            if None in row or None in row.values():
-                raise InputError("has another number of columns than the heading", where=where)
-            yield row, where
-    except csv.Error as error:
-        where = f"{location}:{reader.reader.line_num}"
-        raise InputError(f"is not CSV: {error}", where=where) from error
-
-
-def _read_json(location: str, text: str) -> Iterator[tuple[Any, str]]:
-    try:
-        rows = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}", where=location) from error
-    for number, row in enumerate(rows if isinstance(rows, list) else [rows], 1):
-        yield row, f"{location}: entry {number}"
-
-
-def _entry(folder: str, row: Any, where: str) -> Entry:
-    if not isinstance(row, dict) or "input" not in row or row.keys() - {"input", "place"}:
-        raise InputError("has not the columns `input` and `place`", where=where)
-    source, place = row["input"], row.get("place") or None
-    if not isinstance(source, str) or not source.strip():
-        raise InputError("names no recording", where=where)
-    if place is not None and not (isinstance(place, str) and is_folder_name(place)):
+        row = msgspec.convert(content, _Row)
+    except msgspec.ValidationError as error:
+        hint = "the columns are `input` and `place`"
+        raise InputError(str(error), where=where, hint=hint) from error
+    if row.place and not is_folder_name(row.place):
         hint = "letters, digits, and - _ . inside"
-        raise InputError(f"place {place!r} is no name of a folder", where=where, hint=hint)
-    source = source.strip()
+        raise InputError(f"place {row.place!r} is no name of a folder", where=where, hint=hint)
+    source = row.input.strip()
     if "://" not in source and not source.startswith("/"):
         source = f"{folder}/{source}"
-    return Entry(absolute(source), place, where)
+    return Entry(absolute(source), row.place or None, where)
 
 
 def find_sources(entries: Iterable[Entry]) -> dict[str, str | None]:
@@ -280,10 +268,10 @@ def short_name(location: str) -> str:
 
 def make_unique(name: str, taken: set[str]) -> str:
     """`name`, or `name-2`, `name-3`, ... where it is taken; case does not matter."""
-    unique, number = name, 1
-    while unique.casefold() in taken:
-        number += 1
-        unique = f"{name}-{number}"
+    numbered = (f"{name}-{number}" for number in itertools.count(2))
+    unique = next(
+        each for each in itertools.chain([name], numbered) if each.casefold() not in taken
+    )
     taken.add(unique.casefold())
     return unique
 
@@ -308,24 +296,19 @@ def _inside(fs: Any, path: str, is_pattern: bool) -> list[str]:
     url = path if local else str(fs.unstrip_protocol(path))
     if not fs.isdir(path):
         return [url] if not is_pattern or _is_candidate(Path(path), local) else []
-    if local:
-        names = _recordings_in(Path(path), local)
-    else:
-        with TemporaryDirectory(prefix="stillmap-") as scratch:
-            for name in list_files(url):  # the formats of folders are recognised by names alone
-                (Path(scratch) / name).parent.mkdir(parents=True, exist_ok=True)
-                (Path(scratch) / name).touch()
-            names = _recordings_in(Path(scratch), local)
-    return [f"{url}/{name}" if name else url for name in names]
-
-
-def _recordings_in(folder: Path, has_content: bool) -> list[str]:
-    """Names of the recordings in a folder; an empty one: it is a recording itself."""
-    if _is_candidate(folder, has_content):
-        return [""]
-    inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    inside = [path for path in inside if is_component(path.name)]
-    return sorted(path.name for path in inside if _is_candidate(path, has_content))
+    with TemporaryDirectory(prefix="stillmap-") as scratch:
+        folder = Path(path if local else scratch)
+        for name in () if local else list_files(url):  # formats of folders are known by their names
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+        if _is_candidate(folder, local):
+            return [url]
+        inside = sorted(name for name in os.listdir(folder) if is_component(name))
+        return [
+            f"{url}/{name}"
+            for name in inside
+            if not name.startswith(".") and _is_candidate(folder / name, local)
+        ]
 
 
 def _is_candidate(path: Path, has_content: bool) -> bool:

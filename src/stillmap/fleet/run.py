@@ -3,8 +3,9 @@
 import hashlib
 import logging
 import shutil
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ _PRELOAD = ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]
 _TIMEOUT = 15  # s for the scheduler to answer
 
 
-_FACTS = ("scans", "beams", "duration_s", "bytes")  # in `fleet.json`
+_FACTS = ("scans", "beams", "duration_s")  # in `fleet.json`
 
 
 class Request(NamedTuple):
@@ -145,7 +146,7 @@ def run_fleet(request: Request) -> Fleet:
         with _remove_unfinished(root, request), _open_client(request) as client:
             tasks = [
                 Task("map", source.name, (source.input,), root, request.map_flags)
-                for source in sorted(sources, key=_size, reverse=True)
+                for source in sources
             ]
             mapped = _run_tasks(client, tasks, request)
             jobs = [Job(source, mapped[source.name]) for source in sources]
@@ -205,14 +206,6 @@ def _known_names(root: str) -> dict[str, str]:
     names = [str(one).rstrip("/").rpartition("/")[2] for one in paths]
     known = {name: read_made(root, f"{RESULTS}/{name}") for name in names if is_folder_name(name)}
     return {made.input: name for name, made in known.items() if made is not None}
-
-
-def _size(source: Source) -> int:
-    """Bytes of a recording: the largest are mapped first."""
-    with suppress(Exception):  # it fails later, alone
-        fs, path = open_location(source.input)
-        return int(fs.du(path))
-    return 0
 
 
 @contextmanager
@@ -280,11 +273,11 @@ def _run_tasks(client: Any, tasks: Sequence[Task], request: Request) -> dict[str
     it. Dask runs its task again, as often as `distributed.scheduler.allowed-failures` says.
     """
     dask = import_extra("distributed", "stillmap fleet", "run", group="fleet")
-    waiting, running = list(reversed(tasks)), dict[Any, Task]()
+    waiting, running = deque(tasks), dict[Any, Task]()
     ended, outcomes = dask.as_completed(loop=client.loop), dict[str, Outcome]()
     while waiting or running:
         while waiting and len(running) < max(1, sum(client.nthreads().values())):
-            task = waiting.pop()
+            task = waiting.popleft()
             key = f"{task.command}-{hashlib.sha256(repr(task).encode()).hexdigest()}"
             future = client.submit(run_task, task, request.command, key=key)
             running[future] = task

@@ -105,13 +105,11 @@ def run_task(task: Task, command: Callable[[list[str]], None]) -> Outcome:
     logging.getLogger().addHandler(logging.NullHandler())  # `run.json` has what is to be said
     try:
         return _make(task, command)
-    except InputError as error:
-        return Outcome("full" if _is_disk_full(error) else "failed", str(error))
-    except OSError as error:
-        why = f"{error.filename or 'the result'}: {error.strerror or error}"
-        return Outcome("full" if _is_disk_full(error) else "failed", why)
     except Exception as error:  # of one task: the others go on
-        return Outcome("failed", f"a defect of stillmap: {error!r}")
+        why = str(error) if isinstance(error, InputError) else f"a defect of stillmap: {error!r}"
+        if isinstance(error, OSError):
+            why = f"{error.filename or 'the result'}: {error.strerror or error}"
+        return Outcome("full" if _is_disk_full(error) else "failed", why)
 
 
 def _is_disk_full(error: BaseException | None) -> bool:
@@ -125,9 +123,9 @@ def _is_disk_full(error: BaseException | None) -> bool:
 
 def _make(task: Task, command: Callable[[list[str]], None]) -> Outcome:
     if task.command == "map":
-        content, size = hash_content(task.sources[0])
+        content = hash_content(task.sources[0])
     else:
-        content, size = repr(list(zip(task.results, task.content, strict=True))), 0
+        content = repr(list(zip(task.results, task.content, strict=True)))
     flags = [flag for flag in task.flags if not flag.startswith("--set=threads=")]
     text = json.dumps([task.command, content, flags, package_version()])
     key = hashlib.sha256(text.encode()).hexdigest()
@@ -148,9 +146,8 @@ def _make(task: Task, command: Callable[[list[str]], None]) -> Outcome:
         except InputError as error:
             raise InputError(_replace(str(error), texts)) from error
         _replace_in_files(result, texts)
-        summary = {**_summarize(result), "bytes": size}
         cost = time.process_time() - started, peak_memory_bytes()
-        outcome = Outcome("done", "", key, task.sources[0], *cost, summary)
+        outcome = Outcome("done", "", key, task.sources[0], *cost, _summarize(result))
         write_text(result / MADE, to_json(asdict(outcome)))
         _publish(result, task)
     return outcome
