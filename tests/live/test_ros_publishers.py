@@ -166,7 +166,7 @@ class TestScans:
     def test_clouds_are_split_as_clouds(self, node):
         points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [NAN, 0.0, 0.0], [0.0, 90.0, 0.0]]
         message = point_cloud(5, points)
-        given = {"cloud_topic": "points", "max_laser_range": 50.0}
+        given = {"cloud_topic": ("points",), "max_laser_range": 50.0}
         beams = to_scan_beams(message, "points", Mount(np.eye(4)), Parameters(**given))
         np.testing.assert_array_equal(beams.hit, [True, True, False, False])
         np.testing.assert_allclose(beams.points[3], [0.0, 50.0, 0.0])
