@@ -45,7 +45,7 @@ def make_session(name, recording, poses, p_static):
     graph = chain_poses(poses)
     keyframes = select_keyframes(recording, poses, p_static, graph.keyframes)
     known = (name, None, recording.stamp_ns, poses, graph, keyframes)
-    return Session.of(*known, (0.2, 1.8), np.zeros(3))
+    return Session(*known, (0.2, 1.8), np.zeros(3))
 
 
 def session(name, corners, way, n=40):

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stillmap.core.array_types import Float, Float32
-from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.parallel import resolve_threads
@@ -31,7 +30,7 @@ from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.sweep_localization import SweepLocalizer
 from stillmap.live.sweep_view import empty_map, project_obstacles
 from stillmap.live.update import Update
-from stillmap.pipeline.options import DEFAULTS, Options, resolve_resolution
+from stillmap.pipeline.options import Options, adopt_cells, resolve_resolution
 from stillmap.prepare.plausibility import mapped_range, shorten_far_beams
 from stillmap.results.result import Result, to_options
 from stillmap.tracking import MovingObject
@@ -91,7 +90,7 @@ class LiveMapper:
         self._source, self._mode = place, mode
         self._known = None if place is None else KnownMap(place)
         if self._known is not None and mode == "extend":
-            self.options = _adopt_resolution(self.options, self._known, 2)
+            self.options = adopt_cells(self.options, "map", {"resolution": self._known.resolution})
         self._begin = partial(
             OnlineSlam,
             in_background=background,
@@ -269,7 +268,7 @@ class LiveMapper:
         if dimension == 2:
             return PlanarLocalizer(known, extends)
         if extends:
-            self.options = _adopt_resolution(self.options, known, 3)
+            self.options = adopt_cells(self.options, "map", {"voxel_size": known.resolution})
         threads = resolve_threads(self.options.threads)
         return SweepLocalizer(KnownCloud(self._source, known), extends, self.options, threads)
 
@@ -316,17 +315,3 @@ def _to_matrix(odometry: ArrayLike | None, dimension: int) -> Float | None:
         return None
     given = np.asarray(odometry, np.float64)[None]
     return np.asarray(poses_to_matrices("odometry", given, 1, dimension)[0])
-
-
-def _adopt_resolution(options: Options, known: KnownMap, dimension: int) -> Options:
-    """The options with the edge of the cells of a map that is extended, in 3D of its voxels.
-
-    Raises:
-        InputError: they ask for another one.
-    """
-    name, edge = "resolution" if dimension == 2 else "voxel_size", known.resolution
-    given = getattr(options.slam, name)
-    if given != getattr(DEFAULTS.slam, name) and not np.isclose(given, edge):
-        hint = f"it is extended with slam.{name}={edge:g}"
-        raise InputError(f"the map has cells of {edge:g} m", hint=hint)
-    return override(options, {"slam": {name: edge}})

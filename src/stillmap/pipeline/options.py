@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stillmap.core.config import CheckedOptions, option
+from stillmap.core.config import CheckedOptions, option, override
+from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
@@ -103,3 +105,22 @@ def resolve_resolution(options: Options, dimension: int, default: float = _VOXEL
     voxel = options.slam.voxel_size or default
     slam = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)
     return dataclasses.replace(options, slam=slam)
+
+
+def adopt_cells(options: Options, what: str, edges: Mapping[str, float]) -> Options:
+    """The options with the edges of the cells of a map that is to grow.
+
+    Args:
+        options: see Options.
+        what: the map, in messages.
+        edges: m, by the names of the options of `slam`.
+
+    Raises:
+        InputError: the options ask for others.
+    """
+    for name, edge in edges.items():
+        given = getattr(options.slam, name)
+        if given != getattr(DEFAULTS.slam, name) and not math.isclose(given, edge, rel_tol=1e-5):
+            hint = f"it grows with slam.{name}={edge:g}"
+            raise InputError(f"the {what} has cells of {edge:g} m", hint=hint)
+    return override(options, {"slam": edges})

@@ -3,6 +3,7 @@
 import datetime
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ class PlaceResult(ShortRepr):
     @property
     def names_in_time(self) -> list[str]:
         """Names of the sessions in the order of time."""
-        return [self.place.sessions[k].session.name for k in self.place.in_time()]
+        return [placed.session.name for placed in self.place.in_time()]
 
 
 def finish_place(
@@ -106,7 +107,7 @@ def finish_place(
     planar = show_state(planar_states, planar_changes, limit)
     if place.dimension == 2:
         return PlaceResult(place, refusals, order, planar_changes, planar, planar)
-    states = estimate_place([place.sessions[k].require_evidence()[0] for k in place.in_time()])
+    states = estimate_place([placed.require_evidence()[0] for placed in place.in_time()])
     states, changes = detect_place_changes(states)
     return PlaceResult(place, refusals, order, changes, show_state(states, changes, limit), planar)
 
@@ -123,19 +124,17 @@ def require_map_state(map_state: str, names: Sequence[str]) -> None:
 
 def _find_limit(place: Place, map_state: str) -> int | None:
     """Index of the session, in the order of time, as of which the map is shown; None: majority."""
-    in_time = [place.sessions[k].session for k in place.in_time()]
-    if map_state == LAST:
-        return len(in_time) - 1
+    in_time = [placed.session for placed in place.in_time()]
+    names = [session.name for session in in_time]
     if map_state == MAJORITY:
         return None
-    names = [session.name for session in in_time]
-    if map_state in names:
+    if map_state in names and map_state != LAST:
         return names.index(map_state)
-    until = _parse_date(map_state)
-    before = [k for k, session in enumerate(in_time) if int(session.stamp_ns[0]) <= until]
+    until = in_time[-1].stamp_ns[0] if map_state == LAST else _parse_date(map_state)
+    before = sum(int(session.stamp_ns[0]) <= until for session in in_time)
     if not before:
         raise InputError(f"no session is as old as the state that the map shall show: {map_state}")
-    return before[-1]
+    return before - 1
 
 
 def _parse_date(text: str) -> int:
@@ -164,8 +163,8 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         map_state: see `MergeJob`.
     """
     place, by = result.place, _to_map_frame(result.place)
-    for time, k in enumerate(place.in_time()):
-        _write_session(folder, result, place.sessions[k], time)
+    for time, placed in enumerate(place.in_time()):
+        _write_session(folder, result, placed, time)
     _write_place_files(folder, result)
     transforms = {placed.session.name: _between_maps(placed, by) for placed in place.sessions}
     write_objects(folder, transforms)
@@ -176,7 +175,7 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
             [_label_keyframes(placed, result.shown) for placed in place.sessions]
         )
         write_clouds(folder, joined, shift_poses(poses, by.metres), labels, origin=by.metres)
-    planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
+    planar = [placed.require_evidence()[1] for placed in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)
     # labels are not rated: keyframes are too far apart for that
@@ -290,36 +289,28 @@ def _write_place_files(folder: Path, result: PlaceResult) -> None:
 
 def _join_graphs(place: Place) -> PoseGraph:
     """The pose graph of all sessions; scans are numbered through all of them."""
-    first_scan = np.cumsum([0, *(len(placed.session.stamp_ns) for placed in place.sessions)])
+    sessions = [placed.session for placed in place.sessions]
+    first_scan = accumulate([0, *(len(session.stamp_ns) for session in sessions)])
     keyframes = [
-        placed.session.graph.keyframes + first
-        for placed, first in zip(place.sessions, first_scan, strict=False)
+        session.graph.keyframes + first
+        for session, first in zip(sessions, first_scan, strict=False)
     ]
-    chain, loops = join_constraints([placed.session for placed in place.sessions], place.ties)
+    chain, loops = join_constraints(sessions, place.ties)
     nodes = np.concatenate([placed.nodes for placed in place.sessions])
     return PoseGraph(np.concatenate(keyframes), nodes, [*chain, *loops])
 
 
 def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     """The entries of `sessions.json`, in the order in which the inputs were given."""
-    placed = {
-        placed_session.session.name: placed_session for placed_session in result.place.sessions
+    records: dict[str, dict[str, Any]] = {
+        one.name: {"name": one.name, "input": one.input, "accepted": False, "why": one.why}
+        for one in result.refusals
     }
-    refused = {refusal.name: refusal for refusal in result.refusals}
-    counts = [len(placed_session.session.stamp_ns) for placed_session in result.place.sessions]
-    first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
-    return [
-        _placed_record(placed[name], first_scan[name], _to_map_frame(result.place))
-        if name in placed
-        else {
-            "name": name,
-            "input": refused[name].input,
-            "accepted": False,
-            "why": refused[name].why,
-        }
-        for name in result.order
-        if name in placed or name in refused
-    ]
+    first_scan, by = 0, _to_map_frame(result.place)
+    for placed in result.place.sessions:
+        records[placed.session.name] = _placed_record(placed, first_scan, by)
+        first_scan += len(placed.session.stamp_ns)
+    return [records[name] for name in result.order if name in records]
 
 
 def _placed_record(placed: PlacedSession, first_scan: int, by: Shift) -> dict[str, Any]:
@@ -348,25 +339,20 @@ def _change_records(
         changes: in the order of time, in the map frame.
         names: of the sessions, in the order of time.
     """
-    out = []
+    out = list[dict[str, object]]()
     for number, change in enumerate(changes):
-        record: dict[str, object] = {
-            "id": number,
-            "kind": change.kind,
-            "box": _corners(change.low, change.high),
-        }
+        record = {"id": number, "kind": change.kind, "box": _corners(change.low, change.high)}
         if change.from_low is not None and change.from_high is not None:
             record["from_box"] = _corners(change.from_low, change.from_high)
-        record["between"] = [names[change.before], names[change.after]]
-        record["probability"] = round(change.probability, 4)
-        out.append(record)
+        between = [names[change.before], names[change.after]]
+        out.append({**record, "between": between, "probability": round(change.probability, 4)})
     return out
 
 
 def _corners(low: Float, high: Float) -> list[float]:
     """x0, y0, x1, y1, and in 3D z0, z1."""
-    plane = [*low[:2], *high[:2]]
-    return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]
+    corners = [*low[:2], *high[:2], *low[2:], *high[2:]]
+    return [round(float(x), 3) for x in corners]
 
 
 def _change_cells(

@@ -205,7 +205,7 @@ def _unexplained_share(matches: Matches) -> float:
 
 def estimate_planar(place: Place) -> PlaceStates:
     """The states of the cells in the plane, over the sessions in the order of time."""
-    return estimate_place([place.sessions[k].require_evidence()[1] for k in place.in_time()])
+    return estimate_place([placed.require_evidence()[1] for placed in place.in_time()])
 
 
 def match_session(

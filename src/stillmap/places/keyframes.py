@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from typing import Any
 
@@ -65,9 +66,9 @@ class Session(ShortRepr):
         poses: (T, D+1, D+1) T_session_base.
         graph: the session's own pose graph, in the session's frame.
         keyframes: scans in D dimensions, spaced by travel.
-        planar: the same scans in the plane; in 2D the keyframes themselves.
-        clearance: (K,) height of the base of each keyframe above the ground, metres; 0 in 2D.
+        band: m above the ground, lowest and greatest height of obstacles.
         origin: (3,) m, of the session's frame, in the map frame of the result that it is from.
+        threads: number of threads that project the keyframes.
     """
 
     name: str
@@ -76,29 +77,9 @@ class Session(ShortRepr):
     poses: Float
     graph: PoseGraph
     keyframes: Keyframes
-    planar: Keyframes
-    clearance: Float
+    band: tuple[float, float]
     origin: Float
-
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        input: str | None,
-        stamp_ns: Int64,
-        poses: Float,
-        graph: PoseGraph,
-        keyframes: Keyframes,
-        band: tuple[float, float],
-        origin: Float,
-        threads: int = 1,
-    ) -> "Session":
-        """A session with its keyframes in the plane; `band`: m above the ground, lowest and
-        greatest height of obstacles."""
-        planar, clearance = keyframes, np.zeros(len(keyframes))
-        if keyframes.dimension == 3:
-            planar, clearance = _project(keyframes, band, threads)
-        return cls(name, input, stamp_ns, poses, graph, keyframes, planar, clearance, origin)
+    threads: int = 1
 
     @property
     def dimension(self) -> int:
@@ -109,6 +90,22 @@ class Session(ShortRepr):
     def node_poses(self) -> Float:
         """(N, D+1, D+1) T_session_base of the nodes of the pose graph."""
         return self.poses[self.graph.keyframes]
+
+    @property
+    def planar(self) -> Keyframes:
+        """The keyframes in the plane; in 2D they themselves."""
+        return self._projection[0]
+
+    @property
+    def clearance(self) -> Float:
+        """(K,) height of the base of each keyframe above the ground, metres; 0 in 2D."""
+        return self._projection[1]
+
+    @cached_property
+    def _projection(self) -> tuple[Keyframes, Float]:
+        if self.dimension == 2:
+            return self.keyframes, np.zeros(len(self.keyframes))
+        return _project(self.keyframes, self.band, self.threads)
 
 
 def _project(

@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from stillmap.core import se2
-from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, remove
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.pipeline.options import DEFAULTS, Options
+from stillmap.pipeline.options import Options, adopt_cells
 from stillmap.places.finish import PlaceResult, finish_place, require_map_state, write_place
 from stillmap.places.grow import add_session, start_place
 from stillmap.places.inputs import SessionInput, cell_size, list_sessions, prepare_sessions
@@ -80,8 +79,11 @@ def merge_sessions(
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder, threads)
         if place is not None:
-            frame, options = job.frame or place.frame, _adopt_cells(job.options, place)
-            job = replace(job, frame=frame, options=options)
+            edges = {"resolution": place.resolution}
+            if place.dimension == 3:
+                edges["voxel_size"] = place.voxel_size
+            options = adopt_cells(job.options, "place", edges)
+            job = replace(job, frame=job.frame or place.frame, options=options)
         _check_job(job, [*order, *(session.name for session in job.sessions)])
         sessions = prepare_sessions(job.sessions, job.options, job.odometry, folder, progress)
         order += [session.name for session in sessions]
@@ -112,22 +114,6 @@ def _open_base(
         name = placed.session.name
         copy_session(job.base / "sessions" / name, folder / "sessions" / name)
     return update_evidence(place, threads), refusals, order
-
-
-def _adopt_cells(options: Options, place: Place) -> Options:
-    """The options with the edges of the cells of a place that grows.
-
-    Raises:
-        InputError: they ask for others.
-    """
-    edges = {"resolution": place.resolution}
-    if place.dimension == 3:
-        edges["voxel_size"] = place.voxel_size
-    for name, edge in edges.items():
-        if getattr(options.slam, name) not in (edge, getattr(DEFAULTS.slam, name)):
-            hint = f"it grows with slam.{name}={edge:g}"
-            raise InputError(f"the place has cells of {edge:g} m", hint=hint)
-    return override(options, {"slam": edges})
 
 
 def _grow(

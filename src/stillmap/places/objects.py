@@ -1,7 +1,7 @@
 """Moving objects of sessions in the frame of their place."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content, read_bytes
 from stillmap.core.json import read_json
-from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_traffic
+from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_ply, write_traffic
 from stillmap.results.point_cloud import coordinate_fields, ply_header
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
@@ -51,40 +51,36 @@ def write_objects(folder: Path, transforms: Mapping[str, Float]) -> None:
     records = list[dict[str, Any]]()
     for name, T in transforms.items():
         home = folder / "sessions" / name
-        of_session, clouds = _place_objects(home, T)
-        for record in of_session:
-            number = len(records)
-            if cloud := clouds.get(f"{record['id']:04d}.ply"):
-                (joined / f"{number:04d}.ply").write_bytes(cloud)
-            records.append({**record, "id": number, "session": home.name})
+        for record in _place_objects(home, T):
+            number, cloud = len(records), home / _OBJECTS / f"{record['id']:04d}.ply"
+            if cloud.is_file():
+                copy_content(cloud, joined / f"{number:04d}.ply")
+            records.append({**record, "id": number, "session": name})
     _write_records(joined / _LIST, records)
     write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(joined / _LIST)))
 
 
-def _place_objects(home: Path, T: Float) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
-    """Write the objects of a session; returns their records, and their clouds by name."""
-    source, target = home / "state" / _ORIGINAL, home / _OBJECTS
-    if not source.is_dir():
-        return [], {}
-    target.mkdir()
-    records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
-    _write_records(target / _LIST, records)
-    clouds = {path.name: _transform_cloud(path, T) for path in sorted(source.glob("*.ply"))}
-    for name, cloud in clouds.items():
-        (target / name).write_bytes(cloud)
-    return records, clouds
-
-
-def _read_records(path: Path) -> Iterator[dict[str, Any]]:
-    """The entries of an `objects.json`; none where there is no file.
+def _place_objects(home: Path, T: Float) -> list[dict[str, Any]]:
+    """Write the objects of a session; returns their records.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: what is kept of them is damaged.
     """
-    tracks = read_tracks(path)  # which checks it
-    if not tracks:
-        return
-    yield from read_json(path, _MAX_BYTES)
+    source, target = home / "state" / _ORIGINAL, home / _OBJECTS
+    if not source.is_dir():
+        return []
+    target.mkdir()
+    # read_tracks checks them
+    kept = read_json(source / _LIST, _MAX_BYTES) if read_tracks(source / _LIST) else []
+    records = [_transform_record(record, T) for record in kept]
+    _write_records(target / _LIST, records)
+    D = T.shape[-1] - 1
+    for path in sorted(source.glob("*.ply")):
+        vertices = _read_cloud(path)
+        points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
+        moved = T[:D, :D] @ points + T[:D, D:]
+        write_ply(target / path.name, moved.T, vertices["seconds"], vertices["p_dynamic"])
+    return records
 
 
 def _write_records(path: Path, records: list[dict[str, Any]]) -> None:
@@ -107,32 +103,17 @@ def _transform_record(record: dict[str, Any], T: Float) -> dict[str, Any]:
     return {**record, "track": {**track, **changed}}
 
 
-def _transform_cloud(source: Path, T: Float) -> bytes:
-    """A cloud of an object in another frame.
+def _read_cloud(path: Path) -> NDArray[np.void]:
+    """The points of an object.
 
     Raises:
-        InputError: it is not as it was written.
+        InputError: they are not as they were written.
     """
-    content = read_bytes(source, _MAX_CLOUD)
-    end, vertices = _split_cloud(source, content)
-    D = T.shape[-1] - 1
-    points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
-    for name, values in zip("xyz", T[:D, :D] @ points + T[:D, D:], strict=False):
-        vertices[name] = values
-    return content[:end] + vertices.tobytes()
-
-
-def _split_cloud(path: Path, content: bytes) -> tuple[int, NDArray[np.void]]:
-    """Find the end of the header of an object's cloud, and its points.
-
-    Raises:
-        InputError: it is not as it was written.
-    """
+    content = read_bytes(path, _MAX_CLOUD)
     end = content.find(b"end_header\n") + len(b"end_header\n")
     for is_far in (False, True):
         fields = coordinate_fields(OBJECT_FIELDS, is_far)
-        dtype = np.dtype(fields)
-        count, rest = divmod(len(content) - end, dtype.itemsize)
+        count, rest = divmod(len(content) - end, np.dtype(fields).itemsize)
         if not rest and content[:end] == ply_header(fields, count):
-            return end, np.frombuffer(content, dtype, offset=end).copy()
+            return np.frombuffer(content, fields, offset=end)
     raise InputError("is no cloud of an object as stillmap writes it", where=str(path))

@@ -209,10 +209,9 @@ class Place(ShortRepr):
         """2 or 3."""
         return self.sessions[0].session.dimension
 
-    def in_time(self) -> list[int]:
-        """Indices of the sessions in the order of their first stamps; ties as they were merged."""
-        first = [int(placed.session.stamp_ns[0]) for placed in self.sessions]
-        return sorted(range(len(first)), key=lambda k: first[k])
+    def in_time(self) -> list[PlacedSession]:
+        """The sessions in the order of their first stamps; ties as they were merged."""
+        return sorted(self.sessions, key=lambda placed: int(placed.session.stamp_ns[0]))
 
     def with_nodes(self, nodes: Sequence[Float]) -> "Place":
         """The place with other poses of the nodes of every session."""

@@ -8,11 +8,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.array_folder import parse, read_array, read_npz, read_poses, write_arrays
@@ -190,7 +189,7 @@ def read_session(home: Path, path: str | None, threads: int = 1) -> Session:
     run = ResultFolder(home, read_run(home))
     output, origin = run.output_options, run.read_origin(SESSION_ORIGIN)
     band = output.min_obstacle_height, output.max_obstacle_height
-    return Session.of(home.name, path, stamp_ns, poses, graph, keyframes, band, origin, threads)
+    return Session(home.name, path, stamp_ns, poses, graph, keyframes, band, origin, threads)
 
 
 def _read_stamps(folder: Path) -> Int64:
@@ -259,24 +258,9 @@ def write_joined_beams(folder: Path, homes: list[Path]) -> None:
     """Write `beams/` of a place: the labels of its sessions one after the other."""
     folder.mkdir()
     every = [read_labels(home) for home in homes]
-    offsets, first = [np.zeros(1, np.int64)], 0
-    for labels in every:
-        offsets.append(labels.offset[1:] + first)
-        first += int(labels.offset[-1])
-    write_npy(
-        folder / "stamp_ns.npy", np.concatenate([of_session.stamp_ns for of_session in every])
-    )
-    write_npy(folder / "offset.npy", np.concatenate(offsets))
-    _write_joined(folder / "p_static.npy", [of_session.p_static for of_session in every])
-    _write_joined(folder / "hit.npy", [of_session.hit for of_session in every])
-
-
-def _write_joined(path: Path, parts: Sequence[NDArray[Any]]) -> None:
-    """Write arrays one after the other as one, without all of them in memory."""
-    header = np.lib.format.header_data_from_array_1_0(np.empty(0, parts[0].dtype))
-    with path.open("wb") as file:
-        shape = (sum(len(part) for part in parts),)
-        np.lib.format.write_array_header_1_0(file, {**header, "shape": shape})
-        for part in parts:
-            for block in arrays.iter_bytes(part):
-                file.write(block)
+    counts = np.concatenate([np.diff(labels.offset) for labels in every])
+    write_npy(folder / "offset.npy", np.concatenate([np.zeros(1, np.int64), counts.cumsum()]))
+    for name in ("stamp_ns", "p_static", "hit"):
+        parts = [getattr(labels, name) for labels in every]
+        whole = arrays.empty((sum(map(len, parts)),), parts[0].dtype, folder)
+        write_npy(folder / f"{name}.npy", np.concatenate(parts, out=whole))
