@@ -1,11 +1,11 @@
 """Poses from sweeps of spinning lidars, beside kiss-icp, one after the other in one run.
 
 python benchmarks/lidar_poses.py RECORDING ... [--kiss-python PYTHON] [--kiss-range M ...]
-    [--threads 2] [--odometry] [--beam-times-from-azimuth] [--set slam.odometry.KEY=VALUE ...]
+    [--threads 2] [--set slam.odometry.KEY=VALUE ...]
 
 RECORDING is a folder written by `stillmap simulate WORLD --lidar CHANNELS`, or any recording in
 space that states poses. Poses are compared with the true ones, or else with those stated, which may
-be another program's. Odometry is left out unless asked for. `e = 1` believes every beam, `true e`
+be another program's. Odometry is left out. `e = 1` believes every beam, `true e`
 knows which beams met something static; it is there where there is truth.
 
 ATE is the RMSE in m after the best rigid alignment; RPE over 1 m of travel, RMSE. kiss-icp's poses
@@ -34,7 +34,6 @@ from stillmap.core import config, se2, se3
 from stillmap.core.recording import Recording
 from stillmap.io.reader import read
 from stillmap.pipeline.options import Options
-from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.options import ReadOptions
 from stillmap.results.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.sim import load_truth
@@ -56,7 +55,7 @@ class Case:
     e: NDArray[np.float32] | None
 
 
-def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
+def case_of(path: Path) -> Case:
     """A recording with truth or stated poses.
 
     Raises:
@@ -70,11 +69,7 @@ def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
         truth = recording.T_recorded_base
     else:
         raise ValueError(f"{path}: there is no truth and no poses are stated")
-    if not odometry:
-        recording = recording.without_odometry()
-    if azimuth:
-        recording = add_beam_times(recording, "clockwise")
-    return Case(path.name, recording, truth, e)
+    return Case(path.name, recording.without_odometry(), truth, e)
 
 
 def later(truth: Float, stamp_ns: NDArray[np.int64], seconds: float) -> Float:
@@ -176,15 +171,13 @@ def main() -> None:
     p.add_argument("--kiss-python", help="a Python that has kiss-icp; not set: stillmap alone")
     p.add_argument("--kiss-range", nargs="+", default=[], metavar="M")
     p.add_argument("--threads", type=int, default=2)
-    p.add_argument("--odometry", action="store_true", help="stillmap is told the odometry")
-    p.add_argument("--beam-times-from-azimuth", action="store_true")
     p.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", dest="settings")
     args = p.parse_args()
     changes = config.merge_nested(*(config.parse_assignment(text) for text in args.settings))
     chosen = config.override(Options(), changes)
     lines = []
     for path in args.recordings:
-        case = case_of(path, args.odometry, args.beam_times_from_azimuth)
+        case = case_of(path)
         for line in rows(case, args, chosen):
             print(*line, sep="  ", file=sys.stderr, flush=True)
             lines.append(line)

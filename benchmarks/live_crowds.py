@@ -1,7 +1,7 @@
 """Localization in crowds: lost runs and errors against the number of people.
 
 python benchmarks/live_crowds.py --data DIR [--world hall] [--people 0 30 60 120] [--runs 5]
-    [--max-range 30] [--odometry-noise 1]
+    [--max-range 30]
 python benchmarks/live_crowds.py --data DIR --visitors 0 5 10 20 [--max-range 8] [--arrive 20]
 
 Runs of 400 scans through a known map: localized without a prior, with P(static) and with all beams
@@ -38,13 +38,6 @@ _DISTANCE, _RADIUS = (0.7, 2.5), 0.2  # m, of visitors
 _SWAY, _SWAY_SCANS = (0.3, 0.2), 25.0  # rad and m by which they move about, and how slowly
 _COME_FROM, _WALK = (9.0, 14.0), 1.3  # m, m/s
 _LOST = 0.5  # m
-_ODOMETRY = {
-    "wheel_radius_error": 0.0005,
-    "wheel_base_error": 0.01,
-    "translation_noise": 0.01,
-    "rotation_noise": 0.02,
-    "drift_noise": 0.008,
-}
 
 
 class EveryBeamCounts(OnlineSlam):
@@ -62,7 +55,7 @@ class EveryBeamCounts(OnlineSlam):
 
 def main() -> None:
     args = _parser().parse_args()
-    place = build_known_map(args.data / args.world, args.world, args.map_seed)
+    place = build_known_map(args.data / args.world, args.world)
     is_visited = args.visitors is not None
     lines = []
     for count in args.visitors if is_visited else args.people:
@@ -83,9 +76,6 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--arrive", type=float, default=0.0, help="s")
     p.add_argument("--runs", type=int, default=5)
     p.add_argument("--max-range", type=float, default=30.0, help="m")
-    p.add_argument("--fov", type=float, default=180.0, help="degrees")
-    p.add_argument("--odometry-noise", type=float, default=1.0, help="factor")
-    p.add_argument("--map-seed", type=int, default=11)
     p.add_argument("--first-seed", type=int, default=100)
     return p
 
@@ -95,8 +85,7 @@ def _run(args, place, count, is_visited, run):
     known, T_map_world = place
     changes = {
         "robot": {"scans": _SCANS},
-        "laser": {"max_range": args.max_range, "fov": math.radians(args.fov)},
-        "odometry": {name: args.odometry_noise * value for name, value in _ODOMETRY.items()},
+        "laser": {"max_range": args.max_range, "fov": math.pi},
     }
     if not is_visited:
         changes["crowd"] = {"people": count}

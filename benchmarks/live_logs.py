@@ -31,7 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--names", nargs="+", default=list(_LOGS))
     parser.add_argument("--data", type=Path, required=True, help="folder for results")
-    parser.add_argument("--program", nargs="+", default=merging.default_program())
     parser.add_argument("--finish", action="store_true", help="LiveMapper.finish(), too")
     parser.add_argument("--karto-python", metavar="PYTHON", help="an interpreter with yag-slam")
     parser.add_argument(
@@ -50,11 +49,11 @@ def map_logs(args: argparse.Namespace) -> str:
         relations = _find_relations(args.folder, name)
         batch, live = args.data / f"batch-{name}", args.data / f"live-{name}"
         if not (batch / "run.json").exists():
-            merging.build_map(args.program, log, batch)
+            merging.build_map(log, batch)
         if args.starts:
             lines += _start_later(log, batch, relations, args.starts)
             continue
-        done = merging.call(args.program, "live", "--replay", log, "--threads", 1, "-o", live)
+        done = merging.call("live", "--replay", log, "--threads", 1, "-o", live)
         runs = (batch / "trajectory.tum", live / "live/trajectory.tum", live / "trajectory.tum")
         wanted, answered, known = (_errors(read_planar_trajectory(run), relations) for run in runs)
         finished = _errors(_finish(log), relations) if args.finish else None

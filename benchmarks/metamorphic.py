@@ -25,7 +25,6 @@ import math
 import tempfile
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,11 +37,11 @@ from pairs import name_of, relations_beside
 from tables import Row, grouped, markdown
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.io.carmen.log import ScanLine, parse_scan
 from stillmap.results.eval.readers import read_planar_trajectory, read_relations
 from stillmap.results.eval.trajectory import MAX_DT, compute_relation_errors, nearest_index
 
-Float = NDArray[np.float64]
 Rng = np.random.Generator
 
 # A map is torn where a relation is off by so many metres, and by so many times the worst of the
@@ -54,40 +53,32 @@ _PLACES = 6  # at which a log pauses or has gaps
 _LEAST = 0.04  # of the scans, in a piece
 
 
-class Source(NamedTuple):
-    """The N lines of a log: what scans say, of each stamp, s, and poses of robot and laser (N, 3)
-    as odometry has them."""
-
-    scans: list[ScanLine | None]
-    stamp: Float
-    pose: Float
-    laser: Float
-
-
 class Log(NamedTuple):
-    """A changed log.
+    """The lines of a log, in the order of its file.
 
     Attributes:
-        source: the unchanged one.
-        line: (K,) which of its lines, in the order of the file.
-        stamp: (K,) s. pose: (K, 3) of the robot, as odometry has it.
+        scans: (K,) what scans say; None: the line is odometry.
+        was: (K,) s, the stamps in the unchanged log. stamp: (K,) s.
+        pose: (K, 3) of the robot, as odometry has it. mount: (K, 3, 3) of the laser on it.
         fov: rad. reach: m; all that the laser sees.
     """
 
-    source: Source
-    line: NDArray[np.intp]
+    scans: NDArray[np.object_]
+    was: Float
     stamp: Float
     pose: Float
+    mount: Float
     fov: float = math.inf
     reach: float = math.inf
 
     @property
     def scan(self) -> NDArray[np.bool_]:
-        return np.array([self.source.scans[k] is not None for k in self.line.tolist()])
+        """(K,) whether a line is a scan."""
+        return self.scans.astype(bool)
 
     def part(self, index: NDArray[Any]) -> "Log":
         """Some of the lines, or all in another order."""
-        return self._replace(line=self.line[index], stamp=self.stamp[index], pose=self.pose[index])
+        return Log(*(field[index] for field in self[:5]), self.fov, self.reach)
 
     def in_order(self) -> "Log":
         return self.part(np.argsort(self.stamp, kind="stable"))
@@ -98,26 +89,25 @@ def read_log(path: Path) -> Log:
     kinds = (b"ODOM", b"FLASER", b"ROBOTLASER1")
     with gzip.open(path, "rb") as file:
         words = [line.split() for line in file if line.startswith(kinds)]
-    scans = [None if line[0] == b"ODOM" else parse_scan(line[0], line[1:]) for line in words]
-    given = [words[k][1:4] * 2 if scan is None else scan.poses for k, scan in enumerate(scans)]
+    scans = np.empty(len(words), object)
+    for k, line in enumerate(words):
+        scans[k] = None if line[0] == b"ODOM" else parse_scan(line[0], line[1:])
+    given = [line[1:4] * 2 if s is None else s.poses for line, s in zip(words, scans, strict=True)]
     laser, pose = np.array(given, float).reshape(-1, 2, 3).swapaxes(0, 1)
     stamp = np.array([line[-3] for line in words], float)
-    return Log(Source(scans, stamp, pose, laser), np.arange(len(words)), stamp, pose)
+    return Log(scans, stamp, stamp, pose, se2.inverse(se2.matrix(*pose.T)) @ se2.matrix(*laser.T))
 
 
 def write_log(log: Log, path: Path) -> None:
-    source, k = log.source, log.line
-    mount = se2.inverse(se2.matrix(*source.pose[k].T)) @ se2.matrix(*source.laser[k].T)
-    laser = se2.parameters(se2.matrix(*log.pose.T) @ mount)
-    texts = []
-    for row, line in enumerate(k.tolist()):
-        scan, stamp = source.scans[line], f"{log.stamp[row]:.6f} host {log.stamp[row]:.6f}"
-        poses = [" ".join(f"{x:.6f}" for x in pose[row]) for pose in (laser, log.pose)]
+    lasers, texts = se2.parameters(se2.matrix(*log.pose.T) @ log.mount), []
+    for scan, time, pose, laser in zip(log.scans, log.stamp, log.pose, lasers, strict=True):
+        stamp, at = f"{time:.6f} host {time:.6f}", " ".join(f"{x:.6f}" for x in pose)
         if scan is None:
-            texts.append(f"ODOM {poses[1]} 0 0 0 {stamp}")
+            texts.append(f"ODOM {at} 0 0 0 {stamp}\n")
         else:
-            texts.append(_scan_text(scan, log, " ".join(poses), stamp))
-    path.write_text("\n".join([*texts, ""]))
+            poses = " ".join(f"{x:.6f}" for x in laser) + " " + at
+            texts.append(_scan_text(scan, log, poses, stamp) + "\n")
+    path.write_text("".join(texts))
 
 
 def _scan_text(scan: ScanLine, log: Log, poses: str, stamp: str) -> str:
@@ -140,10 +130,9 @@ def pause(log: Log, rng: Rng) -> Log:
     return log._replace(stamp=log.stamp + later @ rng.uniform(5.0, 300.0, _PLACES))
 
 
-def drop(
-    log: Log, rng: Rng, seconds: tuple[float, float], every: float = 0.0, odometry: bool = False
-) -> Log:
-    """Scans are missing for some seconds, at six places or every so often; odometry, too."""
+def drop(log: Log, rng: Rng, seconds: Any, every: float = 0.0, odometry: bool = False) -> Log:
+    """Scans are missing for `seconds` (least, most), at six places or every so often; odometry, too
+    if it is to be."""
     count = math.ceil(np.ptp(log.stamp) / every) if every else _PLACES
     starts = rng.uniform(log.stamp.min(), log.stamp.max(), count)
     since = log.stamp[:, None] - starts
@@ -153,14 +142,14 @@ def drop(
 
 def delay_lines(log: Log, rng: Rng) -> Log:
     """Of the scans 5 % are written up to 0.9 s late."""
-    late = (log.scan & (rng.random(len(log.line)) < 0.05)) * rng.uniform(0, 0.9, len(log.line))
+    late = (log.scan & (rng.random(len(log.stamp)) < 0.05)) * rng.uniform(0, 0.9, len(log.stamp))
     return log.part(np.argsort(np.maximum.accumulate(log.stamp) + late, kind="stable"))
 
 
 def reverse(log: Log, _rng: Rng) -> Log:
     """Driven backwards, from the end to the start."""
     both = log.stamp.min() + log.stamp.max()
-    return log.part(np.arange(len(log.line))[::-1])._replace(stamp=both - log.stamp[::-1])
+    return log.part(np.arange(len(log.stamp))[::-1])._replace(stamp=both - log.stamp[::-1])
 
 
 def take(log: Log, _rng: Rng, low: float, high: float) -> Log:
@@ -187,6 +176,11 @@ def take_steps(log: Log, rng: Rng, change: Callable[[Float, Float, Rng], Float])
     pose = np.empty_like(log.pose)
     pose[order] = np.column_stack([first[0] + np.cumsum(x), first[1] + np.cumsum(y), theta])
     return log._replace(pose=pose)
+
+
+def scale(log: Log, _rng: Rng, by: float) -> Log:
+    """Odometry that counts so many times the way."""
+    return log._replace(pose=log.pose * (by, by, 1.0))
 
 
 def freeze(steps: Float, stamp: Float, rng: Rng) -> Float:
@@ -224,10 +218,7 @@ CHANGES: dict[str, Callable[[Log, Rng], Log | list[Log]]] = {
     **{f"every-{k}": partial(thin, every=k) for k in (2, 3, 4, 5)},
     **{f"fov-{k}": lambda log, _, k=k: log._replace(fov=math.radians(k)) for k in (180, 120, 90)},
     **{f"range-{k}": lambda log, _, k=k: log._replace(reach=float(k)) for k in (12, 8, 5)},
-    **{
-        f"scale-{k}": lambda log, _, k=k: log._replace(pose=log.pose * (k, k, 1))
-        for k in (0.9, 1.1)
-    },
+    **{f"scale-{k}": partial(scale, by=k) for k in (0.9, 1.1)},
     "frozen": partial(take_steps, change=freeze),
     "no-direction": partial(  # ways back count as ways ahead
         take_steps, change=lambda steps, *_: np.c_[np.abs(steps[:, 0]), steps[:, 1:]]
@@ -238,8 +229,7 @@ CHANGES: dict[str, Callable[[Log, Rng], Log | list[Log]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A change of a log; `folder` holds the map of the unchanged one, and of each change."""
 
     path: Path
@@ -264,7 +254,7 @@ def run(job: Job) -> dict[str, Any]:
             write_log(some, file)
         words = ("merge" if len(files) > 1 else "map", *files, "--threads", 1)
         try:
-            done = merging.call(merging.default_program(), *words, "-o", job.result())
+            done = merging.call(*words, "-o", job.result())
         except RuntimeError as error:
             print(error, flush=True)
             return {**row, "status": "DEFECT"}
@@ -304,10 +294,9 @@ def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
 def _trajectory(result: Path, logs: Sequence[Log]) -> Float:
     """(N, 4) t, x, y, theta by the stamps of the unchanged log."""
     rows = read_planar_trajectory(result / "trajectory.tum")
-    scans = [log.part(log.scan) for log in logs]
-    stamp = np.concatenate([log.stamp for log in scans])
-    was, order = np.concatenate([log.source.stamp[log.line] for log in scans]), np.argsort(stamp)
-    rows[:, 0] = was[order][nearest_index(stamp[order], rows[:, 0])[0]]
+    stamps = np.concatenate([np.c_[log.stamp, log.was][log.scan] for log in logs])
+    stamp, was = stamps[np.argsort(stamps[:, 0])].T
+    rows[:, 0] = was[nearest_index(stamp, rows[:, 0])[0]]
     return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
@@ -360,6 +349,7 @@ def main() -> None:
                 rows.append(row)
                 if args.out:
                     append(args.out, row)
+            names = [row["log"] for row in rows if row["status"] == "done"]
     print(table(rows))
 
 

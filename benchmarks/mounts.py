@@ -1,12 +1,12 @@
 """Wrong mounts and odometry errors that nobody told: ATE against that of the run that was told.
 
 python benchmarks/mounts.py [--cases NAME|GROUP ...] [--errors NAME ...] [--factors 1 2]
-    [--scans 800] [--seeds tuning|reporting] [--n-seeds 5] [--untold] [--processes 2]
+    [--scans 800] [--seeds tuning|reporting] [--n-seeds 5] [--processes 2]
 
 Every world is recorded with one error that the recording does not tell, mapped as it is ("found"),
-and once more as one that tells the mount, or whose odometry has no such error ("told"). `--untold`
-maps it a third time without calibration. Factors are on the noise and errors of the wheels. With
-the error "none" nothing is wrong: "applied" counts what was calibrated nevertheless.
+and once more as one that tells the mount, or whose odometry has no such error ("told"). Factors are
+on the noise and errors of the wheels. With the error "none" nothing is wrong: "applied" counts what
+was calibrated nevertheless.
 """
 
 import dataclasses
@@ -61,7 +61,6 @@ COLUMNS = (
     Column("told", "told: ATE, m", ".4f"),
     Column("found", "found", ".4f"),
     Column("ratio", "found / told", ".2f"),
-    Column("untold", "not calibrated", ".3f"),
     Column("applied", "applied", ".1f"),
     Column("share", "CPU of the calibration, %", ".1f"),
 )
@@ -76,7 +75,6 @@ class Job:
     factor: float
     seed: int
     scans: int
-    untold: bool
 
 
 def main() -> None:
@@ -86,11 +84,10 @@ def main() -> None:
     p.add_argument("--errors", nargs="+", choices=ERRORS, default=list(ERRORS))
     p.add_argument("--factors", nargs="+", type=float, default=[1.0])
     p.add_argument("--scans", type=int, default=800)
-    p.add_argument("--untold", action="store_true")
     p.add_argument("--processes", type=int, default=2)
     args = p.parse_args()
     jobs = [
-        Job(case, error, factor, seed, args.scans, args.untold)
+        Job(case, error, factor, seed, args.scans)
         for case, error, factor, seed in itertools.product(
             chosen(args.cases), args.errors, args.factors, seeds_of(args)
         )
@@ -104,9 +101,7 @@ def row_of(job: Job) -> Row:
     truth = simulated(job.case.name, job.factor, job.seed, job.scans, ERRORS[job.error])
     told = told_ate(job.case.name, job.factor, job.seed, job.scans, json.dumps(told_of(job.error)))
     found, about = mapped(truth, calibrated=True)
-    scores = {"told": told, "found": found, "ratio": found / told, "untold": math.nan, **about}
-    if job.untold:
-        scores["untold"], _ = mapped(truth, calibrated=False)
+    scores = {"told": told, "found": found, "ratio": found / told, **about}
     return {"case": job.case.name, "error": job.error, "factor": job.factor, **scores}
 
 

@@ -1,23 +1,18 @@
-"""Recordings cut into sessions: a log into laps, a drive into pieces, a simulated run evenly."""
+"""Recordings cut into sessions: a log into laps, a simulated run evenly."""
 
-import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from unpacked import unpack
 
 import stillmap
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
-from stillmap.io.trajectory import write_tum
 
 _AWAY, _BACK = 15.0, 8.0  # m from the start: a lap has been there, and ends near it
 _FAR = 200.0  # m, within which each lap is shifted
-_DAY_NS = 86_400 * 10**9
 
 
 def select_scans(recording: Recording, scans: NDArray[np.intp]) -> Recording:
@@ -93,38 +88,3 @@ def write_cuts(run: Path, folder: Path, count: int, rng: np.random.Generator) ->
 def _turn_odometry(part: Recording, rng: np.random.Generator) -> Recording:
     T = se2.matrix(*rng.uniform(-_FAR, _FAR, 2), rng.uniform(-np.pi, np.pi))
     return part if part.T_odom_base is None else replace(part, T_odom_base=T @ part.T_odom_base)
-
-
-def write_pieces(pack: Path, folder: Path, count: int, interleaved: bool = False) -> list[Path]:
-    """Cut a packed drive into pieces without a common sweep, a day apart, without poses.
-
-    One after the other, or interleaved: each has every `count`-th sweep of the whole way.
-
-    Beside the pieces lies the truth about them, as of simulated sessions: the poses of the pack.
-    """
-    whole = stillmap.read(unpack(pack, folder / "whole")).without_odometry()
-    with np.load(pack) as arrays:
-        poses = np.asarray(arrays["pose"], np.float64)
-    every = np.arange(whole.n_scans)
-    chosen = [every[k::count] for k in range(count)]
-    if not interleaved:
-        chosen = np.array_split(every, count)
-    pieces, about = [], []
-    for k, scans in enumerate(chosen):
-        part = select_scans(whole, scans)
-        part = replace(part, stamp_ns=part.stamp_ns + k * _DAY_NS)
-        pieces.append(folder / f"piece-{k + 1}")
-        stillmap_folder.write(part, pieces[-1])
-        (pieces[-1] / "truth").mkdir()
-        own = poses[scans]
-        write_tum(pieces[-1] / "truth/trajectory.tum", part.stamp_ns, own)
-        about.append({"name": pieces[-1].name, "place": 0, "T_world_session": own[0].tolist()})
-    _write_truth(folder, about)
-    return pieces
-
-
-def _write_truth(folder: Path, sessions: Sequence[dict]) -> None:
-    n = len(sessions)
-    unknown = [[1.0] * n] * n  # how much they overlap is not known
-    tree = {"sessions": sessions, "objects": [], "changes": [], "overlap": unknown}
-    (folder / "sessions.json").write_text(json.dumps(tree) + "\n", encoding="utf-8")

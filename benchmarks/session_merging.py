@@ -20,6 +20,7 @@ from stillmap.core.se2 import inverse
 from stillmap.results.reader import read_grid
 
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
+STILLMAP = (sys.executable, "-m", "stillmap")
 REFUSED = 2  # exit status: fewer than two sessions could be placed
 
 
@@ -36,8 +37,8 @@ class Merged:
     memory: int
 
 
-def call(program: Sequence[str], *words: object) -> Merged:
-    """Run a command with -o as its last word but one.
+def call(*words: object) -> Merged:
+    """Run a command of stillmap with -o as its last word but one.
 
     Raises:
         RuntimeError: a defect: a status other than 0 and 2.
@@ -48,7 +49,7 @@ def call(program: Sequence[str], *words: object) -> Merged:
     started = time.perf_counter()
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
-            [*program, *map(str, words)], stdout=subprocess.DEVNULL, stderr=errors
+            [*STILLMAP, *map(str, words)], stdout=subprocess.DEVNULL, stderr=errors
         )
         _, status, used = os.wait4(process.pid, 0)  # of this child alone
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -62,18 +63,14 @@ def call(program: Sequence[str], *words: object) -> Merged:
     return Merged(place, process.returncode, seconds, cpu, last[0], memory)
 
 
-def merge(program: Sequence[str], sessions: Sequence[Path], place: Path) -> Merged:
+def merge(sessions: Sequence[Path], place: Path) -> Merged:
     """`stillmap merge SESSION... --threads 1 -o PLACE`."""
-    return call(program, "merge", *sessions, "--threads", 1, "-o", place)
+    return call("merge", *sessions, "--threads", 1, "-o", place)
 
 
-def build_map(program: Sequence[str], session: Path, result: Path) -> Merged:
+def build_map(session: Path, result: Path) -> Merged:
     """`stillmap map SESSION --threads 1 -o RESULT`."""
-    return call(program, "map", session, "--threads", 1, "-o", result)
-
-
-def default_program() -> list[str]:
-    return [sys.executable, "-m", "stillmap"]
+    return call("map", session, "--threads", 1, "-o", result)
 
 
 def poses_of(merged: Merged, truth_folder: Path) -> list[PoseScores]:

@@ -7,7 +7,6 @@ python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--first-
 python benchmarks/sessions.py growth --data DIR [--world office] [--sessions 32]
 python benchmarks/sessions.py laps LOG.clf.gz --data DIR
 python benchmarks/sessions.py cuts --data DIR [--worlds office hall] [--seeds 3] [--pieces 4]
-python benchmarks/sessions.py drive PACK.npz --data DIR [--pieces 3] [--interleaved]
 
 alignment: pairs of simulated sessions from random starts, by how much of the second one's hits lie
 in what the first one saw, and pairs that have nothing in common; --lasers: also two logs of
@@ -19,8 +18,6 @@ growth: each session is mapped, then one result after the other is added to the 
 laps: a log with NAME.reference.txt and NAME.relations beside it, cut into laps that are turned and
 shifted at random, against the uncut run.
 cuts: long simulated runs, cut likewise into equal sessions, against the uncut run.
-drive: packed sweeps of a street, cut into pieces without a common sweep: one after the other, or
-interleaved, so that all drive the same way.
 
 Simulated sessions are kept in DIR and used again; of growth also their results. Times are
 wall-clock unless they are named CPU.
@@ -40,7 +37,7 @@ import session_merging as merging
 from common import make_parser
 from place_poses import FRAME_DT, PoseScores
 from place_scores import score_place
-from session_laps import write_cuts, write_laps, write_pieces
+from session_laps import write_cuts, write_laps
 from session_sets import LASER, PairSet, prepare_days, prepare_pairs
 from tables import markdown
 
@@ -76,12 +73,10 @@ def _parser() -> argparse.ArgumentParser:
         ("growth", grow),
         ("laps", merge_laps),
         ("cuts", merge_cuts),
-        ("drive", merge_drive),
     ):
         one = commands.add_parser(name)
         one.set_defaults(run=run)
         one.add_argument("--data", type=Path, required=True, help="folder for sessions and places")
-        one.add_argument("--program", nargs="+", default=merging.default_program())
         if name in ("alignment", "labels", "cuts"):
             one.add_argument("--seeds", type=int, default=3)
         if name in ("alignment", "labels"):
@@ -99,11 +94,8 @@ def _parser() -> argparse.ArgumentParser:
             one.add_argument("--scans", type=int)
         if name == "laps":
             one.add_argument("log", type=Path)
-        if name in ("cuts", "drive"):
+        if name == "cuts":
             one.add_argument("--pieces", type=int, default=3)
-        if name == "drive":
-            one.add_argument("pack", type=Path)
-            one.add_argument("--interleaved", action="store_true")
     return p
 
 
@@ -117,7 +109,7 @@ def align_pairs(args: argparse.Namespace) -> str:
         rows.setdefault(pair.kind, []).append(done)
     for one, other in _STRANGERS if args.lasers else ():
         logs = [args.lasers / f"{name}.clf.gz" for name in (one, other)]
-        merged = merging.merge(args.program, logs, args.data / "places/strangers")
+        merged = merging.merge(logs, args.data / "places/strangers")
         rows.setdefault("other buildings", []).append((merged, None))
     titles = ["overlap", "pairs", "right", "coarse", "wrong", "refused"]
     titles += ["median m (max)", "median deg (max)", "seam m (max)", "s (max)"]
@@ -127,7 +119,7 @@ def align_pairs(args: argparse.Namespace) -> str:
 def _align(pair: PairSet, args: argparse.Namespace) -> Done:
     sessions = [pair.folder / f"session-{k}" for k in (1, 2)]
     place = args.data / "places" / pair.folder.name
-    merged = merging.merge(args.program, sessions, place)
+    merged = merging.merge(sessions, place)
     scores = merging.poses_of(merged, pair.folder)
     shutil.rmtree(place, ignore_errors=True)
     return merged, scores[1] if len(scores) > 1 else None
@@ -179,9 +171,9 @@ def score_labels(args: argparse.Namespace) -> str:
         for session in sessions:
             result = args.data / "singles" / days.name / session.name
             if not (result / "map.npz").exists():
-                merging.build_map(args.program, session, result)
+                merging.build_map(session, result)
             singles.append(result)
-        merged = merging.merge(args.program, sessions, args.data / "places" / days.name)
+        merged = merging.merge(sessions, args.data / "places" / days.name)
         if merged.status == merging.REFUSED:
             lines.append([world, str(seed), "refused", *["-"] * 9])
             continue
@@ -215,17 +207,17 @@ def grow(args: argparse.Namespace) -> str:
     once."""
     days = prepare_days(args.data, args.world, args.sessions, 1, args.scans)
     sessions = [days / f"session-{k + 1}" for k in range(args.sessions)]
-    mapped = [_map_once(args, one, args.data / f"maps-{days.name}") for one in sessions]
+    mapped = [_map_once(one, args.data / f"maps-{days.name}") for one in sessions]
     work = args.data / "places" / f"growth-{days.name}"
     shutil.rmtree(work, ignore_errors=True)
     hours, lines, place = _hours(sessions[0]), [], mapped[0][0]
     for k in range(1, args.sessions):
         hours += _hours(sessions[k])
-        merged = merging.merge(args.program, [place, mapped[k][0]], work / f"place-{k + 1}")
+        merged = merging.merge([place, mapped[k][0]], work / f"place-{k + 1}")
         if merged.status == merging.REFUSED:
             lines.append([str(k + 1), "refused: " + merged.words, *["-"] * 11])
             continue
-        lines.append(_growth_row(k + 1, merged, hours, mapped, work, args))
+        lines.append(_growth_row(k + 1, merged, hours, mapped, work))
         print("|".join(lines[-1]), flush=True)
         if place.parent == work:
             shutil.rmtree(place)
@@ -235,21 +227,16 @@ def grow(args: argparse.Namespace) -> str:
     return markdown(titles, lines)
 
 
-def _map_once(args: argparse.Namespace, session: Path, folder: Path) -> Mapped:
+def _map_once(session: Path, folder: Path) -> Mapped:
     """The result of a session, mapped unless it is there, and the CPU seconds that it took."""
     result, note = folder / session.name, folder / f"{session.name}.cpu"
     if not note.exists():
-        note.write_text(str(merging.build_map(args.program, session, result).cpu))
+        note.write_text(str(merging.build_map(session, result).cpu))
     return result, float(note.read_text())
 
 
 def _growth_row(
-    count: int,
-    merged: merging.Merged,
-    hours: float,
-    mapped: Sequence[Mapped],
-    work: Path,
-    args: argparse.Namespace,
+    count: int, merged: merging.Merged, hours: float, mapped: Sequence[Mapped], work: Path
 ) -> list[str]:
     size = merging.folder_bytes(merged.place)
     line = [str(count), f"{mapped[count - 1][1]:.1f}", *_costs(merged), f"{size / 1e6:.1f}"]
@@ -257,7 +244,7 @@ def _growth_row(
     if count & (count - 1):
         return [*line, *[""] * 5]
     results = [one for one, _ in mapped[:count]]
-    at_once = merging.merge(args.program, results, work / "at-once")
+    at_once = merging.merge(results, work / "at-once")
     if at_once.status == merging.REFUSED:
         return [*line, "refused", *["-"] * 4]
     differ = merging.largest_difference(merged.place, at_once.place)
@@ -282,8 +269,8 @@ def merge_laps(args: argparse.Namespace) -> str:
     folder.mkdir(parents=True)
     reference = args.log.with_name(f"{name}.reference.txt")
     laps = write_laps(args.log, reference, folder, np.random.default_rng(_LAP_SEED))
-    uncut = merging.build_map(args.program, args.log, folder / "uncut")
-    merged = merging.merge(args.program, laps, folder / "place")
+    uncut = merging.build_map(args.log, folder / "uncut")
+    merged = merging.merge(laps, folder / "place")
     lines = []
     for what, done in (("uncut", uncut), (f"{len(laps)} laps merged", merged)):
         if done.status == merging.REFUSED:
@@ -330,8 +317,8 @@ def merge_cuts(args: argparse.Namespace) -> str:
         write_simulation(simulation, folder / "run")
         rng = np.random.default_rng([_LAP_SEED, seed])
         cuts = write_cuts(folder / "run", folder, args.pieces, rng)
-        uncut = merging.build_map(args.program, folder / "run", folder / "uncut")
-        merged = merging.merge(args.program, cuts, folder / "place")
+        uncut = merging.build_map(folder / "run", folder / "uncut")
+        merged = merging.merge(cuts, folder / "place")
         if merged.status == merging.REFUSED:
             lines.append([world, str(seed), "none", *["-"] * 5])
             continue
@@ -348,30 +335,6 @@ def _trajectory_errors(result: Path, run: Path) -> ErrorStats:
     true = read_trajectory(run / "truth/trajectory.tum")
     i, j = associate_trajectories(estimated.stamp_s, true.stamp_s, FRAME_DT)
     return compute_absolute_errors(estimated.poses[i], true.poses[j])
-
-
-def merge_drive(args: argparse.Namespace) -> str:
-    """A line per piece of a drive."""
-    order = "interleaved" if args.interleaved else "pieces"
-    folder = args.data / f"{order}-{args.pack.stem}-{args.pieces}"
-    shutil.rmtree(folder, ignore_errors=True)
-    pieces = write_pieces(args.pack, folder, args.pieces, args.interleaved)
-    merged = merging.merge(args.program, pieces, folder / "place")
-    scores = merging.poses_of(merged, folder)
-    if not scores:
-        return f"refused: {merged.words}"
-    lines = [
-        [
-            one.name,
-            one.verdict,
-            *(f"{v:.3f}" for v in (one.translation, one.rotation, one.mean_distance)),
-            f"{one.max_distance:.3f}",
-        ]
-        for one in scores
-    ]
-    titles = ["piece", "verdict", "off by m", "deg", "poses mean m", "max m"]
-    why = [f"{one['name']}: {one['why']}" for one in _records(merged.place) if "why" in one]
-    return "\n".join([markdown(titles, lines), *why, f"{merged.seconds:.0f} s"])
 
 
 if __name__ == "__main__":

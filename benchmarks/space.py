@@ -1,9 +1,9 @@
 """What is static in space: labels of sweeps, time and memory, beside other programs in one run.
 
-python benchmarks/space.py [--worlds street ...] [--lidar 64 ...] [--scans 150] [--at-once]
-    [--no-stops] [--seeds tuning|reporting] [--n-seeds 1] [--folders DIR ...]
+python benchmarks/space.py [--worlds street ...] [--lidar 64 ...] [--scans 150]
+    [--seeds tuning|reporting] [--n-seeds 1] [--folders DIR ...]
     [--methods stillmap paper ...] [--estimated-poses] [--peer-python PYTHON]
-    [--set section.key=value ...] [--threads 2] [--rounds 1] [--json ROWS] [--read ROWS ...]
+    [--set section.key=value ...] [--threads 2] [--rounds 1] [--json ROWS]
 
 DIR holds `velodyne/*.bin`, `labels/*.label` (252 moving, 9 static, others not scored), `times.txt`
 and `poses_lidar.txt`. PYTHON is an interpreter of its own, so that nothing else is touched:
@@ -64,10 +64,7 @@ COST = (
 
 def main() -> None:
     args = _arguments()
-    rows = [json.loads(line) for file in args.read for line in file.read_text().splitlines()]
-    if not args.read:
-        rows = list(_run(args))
-    print(tables(rows))
+    print(tables(list(_run(args))))
 
 
 def _arguments() -> argparse.Namespace:
@@ -76,12 +73,6 @@ def _arguments() -> argparse.Namespace:
     p.add_argument("--lidar", nargs="+", type=int, default=[64], metavar="CHANNELS")
     p.add_argument("--columns", type=int, default=1875, help="azimuths per turn")
     p.add_argument("--scans", type=int, default=150, help="of a simulated run")
-    p.add_argument(
-        "--no-stops", dest="stops", action="store_false", help="nobody stops now and then"
-    )
-    p.add_argument(
-        "--at-once", action="store_true", help="simulate lidars whose turns take no time"
-    )
     add_seed_arguments(p)
     p.set_defaults(n_seeds=1)
     p.add_argument("--folders", nargs="+", type=Path, default=[], metavar="DIR")
@@ -93,7 +84,6 @@ def _arguments() -> argparse.Namespace:
     p.add_argument("--rounds", type=int, default=1)
     p.add_argument("--keep", type=Path, metavar="DIR", help="keep cases and labels there")
     p.add_argument("--json", type=Path, help="append rows to this file, one a line")
-    p.add_argument("--read", type=Path, nargs="+", default=[], help="rows to print: runs nothing")
     return p.parse_args()
 
 
@@ -101,8 +91,8 @@ def _run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for text in args.set:
         config.parse_assignment(text)  # refuses before hours have passed
     methods = chosen_methods(args.methods, args.peer_python is not None, args.estimated_poses)
-    lidar = {"sweep": not args.at_once, "columns": args.columns}
-    cases = simulated(args.worlds, args.lidar, seeds_of(args), args.scans, lidar, args.stops)
+    lidar = {"columns": args.columns}
+    cases = simulated(args.worlds, args.lidar, seeds_of(args), args.scans, lidar)
     cases += [Case(path.name, None, 0, path) for path in args.folders]
     for case in cases:
         with tempfile.TemporaryDirectory() as scratch:

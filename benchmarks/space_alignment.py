@@ -115,7 +115,7 @@ def load_session(data: Path, path: Path) -> Mapped:
     name = f"{path.parent.name}-{path.name}"
     result, cloud = data / "results" / name, data / "clouds" / f"{name}.npy"
     if not (result / "run.json").exists():
-        program = [*merging.default_program(), "map", str(path), "-o", str(result)]
+        program = [*merging.STILLMAP, "map", str(path), "-o", str(result)]
         subprocess.run([*program, "--quiet", "--threads", "1"], check=True)
     loaded = stillmap.load(result)
     session = to_session(name, loaded, loaded.deskewed, 1)

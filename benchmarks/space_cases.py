@@ -73,14 +73,12 @@ def simulated(
     seeds: Iterable[int],
     scans: int,
     lidar: Mapping[str, Any],
-    stops: bool = True,
 ) -> list[Case]:
-    """Every world seen by every lidar, with every seed; without `stops` everybody moves on."""
-    never = {} if stops else {kind: {"stopping_share": 0.0} for kind in ("traffic", "crowd")}
+    """Every world seen by every lidar, with every seed."""
     return [
         Case(
-            f"{world}, {n}" + ("" if stops else ", no stops"),
-            {"lidar": {"channels": n, **lidar}, "robot": {"scans": scans}, **never},
+            f"{world}, {n}",
+            {"lidar": {"channels": n, **lidar}, "robot": {"scans": scans}},
             seed,
         )
         for world, n, seed in itertools.product(worlds, channels, seeds)

@@ -1,16 +1,15 @@
 """Long recordings in space: time per sweep and memory over their length, poses given.
 
 python benchmarks/space_growth.py [--world drive] [--sweeps 100 1000 5000] [--lidar 64]
-    [--columns 450] [--seed 0] [--threads 2] [--keep FOLDER] [--models]
+    [--columns 450] [--seed 0] [--threads 2] [--keep FOLDER]
     [--set section.key=value ...]
 
 One recording is simulated, as long as the longest; the shorter ones are its beginnings. A robot
 that comes to the end of its route turns back. With --keep the recording is looked for in a folder,
 or put there: 1.3 MB a sweep of 64 channels and 900 columns. Each length has a process of its own,
 which reads the recording, labels it and writes the result; its memory is the largest resident size,
-in which mapped pages of files count. With --models it makes models of the place and of what moved,
-too. "m2 seen" are squares of a metre in which beams ended: memory may grow with these, time per
-sweep not at all.
+in which mapped pages of files count. "m2 seen" are squares of a metre in which beams ended: memory
+may grow with these, time per sweep not at all.
 """
 
 import json
@@ -52,7 +51,6 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--threads", type=int, default=2)
     p.add_argument("--keep", type=Path, metavar="FOLDER")
-    p.add_argument("--models", action="store_true")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     args = p.parse_args()
     chosen = options_of(args.set, args.threads)  # refuses before hours have passed
@@ -66,7 +64,7 @@ def main() -> None:
         for sweeps in args.sweeps:
             first, out = Path(work, f"first-{sweeps}"), Path(work, f"out-{sweeps}")
             about = in_fresh_process(write_beginning, whole, sweeps, first)
-            cost = in_fresh_process(cost_of, first, chosen, out, args.models)
+            cost = in_fresh_process(cost_of, first, chosen, out)
             shutil.rmtree(first)
             shutil.rmtree(out)
             rows.append({"sweeps": sweeps, **about, **cost})
@@ -106,18 +104,15 @@ def size_of(recording: stillmap.Recording, poses: Float) -> dict[str, float]:
     return {"metres": float(metres), "area": float(len(seen)), "beams": beams_each}
 
 
-def cost_of(
-    first: Path, chosen: stillmap.Options, out: Path, with_models: bool = False
-) -> dict[str, Any]:
+def cost_of(first: Path, chosen: stillmap.Options, out: Path) -> dict[str, Any]:
     """Seconds per sweep and peak memory of the whole job, and of its stages."""
     recording, poses = stillmap_folder.read(first), np.load(first / _POSES)
     sweeps = recording.n_scans
     stages, wall, cpu = StageTimer(), time.perf_counter(), time.process_time()
     loaded = peak_memory_bytes()
     result = map_recording(recording, chosen, poses=poses, stages=stages)
-    models = stillmap.build_models(result, stages=stages) if with_models else None
     with stages.measure("writing"):
-        save(result, out, models=models)
+        save(result, out)
     took = {**result.stages, **stages.to_dict()}
     return {
         "seconds": (time.perf_counter() - wall) / sweeps,
