@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
-    from stillmap.io import filter_writers
+    from stillmap.io import filter_writers, writers
     from stillmap.results.folder import open_result
     from stillmap.results.reader import is_place
 
@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
         else:
             result = open_result(folder, args.input)
             target = _find_target(result, output, args.to)
-            filter_writers.require_free(target, output, result.sources[0], args.overwrite)
+            writers.require_free(output, target.marker, args.overwrite)
+            filter_writers.require_outside(output, result.sources[0])
             summary = _write_filtered(result, target, output, "", args)
     if args.json:
         print_json({"output": str(output), **summary})

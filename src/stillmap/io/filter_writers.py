@@ -21,11 +21,13 @@ from stillmap.io import stillmap_folder, writers
 from stillmap.io.filtered_clouds import (
     FilterJob,
     Omissions,
+    filter_pcd,
+    filter_ply,
+    write_files,
     write_kitti,
     write_las,
-    write_pcd,
-    write_ply,
 )
+from stillmap.io.point_cloud import pcd, ply
 from stillmap.io.registry import FORMATS, detect_format, load_later
 from stillmap.io.ros.messages import detect_kind
 
@@ -72,8 +74,16 @@ _OWN: dict[str, tuple[str, str, Write]] = {
     "ROS bag": ("", "metadata.yaml", load_later("ros.filtered", "write_filtered")),
     "CARMEN log": ("carmen", "", load_later("carmen.writer", "write_filtered")),
     "KITTI folder": ("kitti", "velodyne*", write_kitti),
-    "PCD": ("pcd", "*.[pP][cC][dD]", write_pcd),
-    "PLY": ("ply", "*.[pP][lL][yY]", write_ply),
+    "PCD": (
+        "pcd",
+        "*.[pP][cC][dD]",
+        partial(write_files, extensions=pcd.EXTENSIONS, filter_file=filter_pcd),
+    ),
+    "PLY": (
+        "ply",
+        "*.[pP][lL][yY]",
+        partial(write_files, extensions=ply.EXTENSIONS, filter_file=filter_ply),
+    ),
     "LAS": ("las", "*.[lL][aA][sSzZ]", write_las),
 }
 
@@ -132,16 +142,6 @@ def _require_ending(output: Path, endings: tuple[str, ...]) -> None:
         raise InputError("is not written in the format of that name", where=str(output), hint=hint)
 
 
-def require_free(target: FilterTarget, output: Path, source: Path, overwrite: bool) -> None:
-    """Refuse an output that is taken, or that lies in the folder which is copied.
-
-    Raises:
-        InputError: it is.
-    """
-    writers.require_free(output, target.marker, overwrite)
-    require_outside(output, source)
-
-
 def require_outside(output: Path, source: Path) -> None:
     """Refuse an output that lies in the folder of the recording.
 
@@ -197,10 +197,8 @@ def find_ending(source: Path | None, to: str | None) -> str:
         to: name of the other format; None: its own.
     """
     own = ""
-    if source is not None and not _is_folder(source):
-        form, name = detect_format(source), source.name.lower()
-        known = [end for end in form.endings if name.endswith(end)]
-        own = max(known, key=len, default=source.suffix) if form.name in _OWN else ""
+    if source is not None and not _is_folder(source) and detect_format(source).name in _OWN:
+        own = "".join(source.suffixes[-2 if source.suffix.lower() == ".gz" else -1 :])
     if to is None:
         return own
     endings = writers.find_writer(Path(), to).endings

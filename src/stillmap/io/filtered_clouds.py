@@ -97,9 +97,6 @@ def other_recording_error(path: Path) -> InputError:
 FilterFile = Callable[[Path, Path, Bool], None]
 
 _LABEL = np.dtype("V4")  # of SemanticKITTI
-# lines of headers with the number of points after group 1
-_PCD_COUNTS = rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+"
-_PLY_COUNTS = rb"(?m)^(\s*element\s+vertex\s+)\d+"
 
 
 def write_kitti(job: FilterJob) -> Omissions:
@@ -131,34 +128,26 @@ def write_kitti(job: FilterJob) -> Omissions:
     return Omissions(sum(mask is None for mask in masks))
 
 
-def write_pcd(job: FilterJob) -> Omissions:
-    """Copy a PCD file or folder; points of organised clouds become NaN, others are removed."""
-
-    def filter_file(path: Path, new: Path, mask: Bool) -> None:
-        _copy_table(pcd.read_header(path)[0], new, mask, _PCD_COUNTS)
-
-    return _write_files(job, pcd.EXTENSIONS, filter_file)
+def filter_pcd(path: Path, new: Path, mask: Bool) -> None:
+    """Copy a PCD file; points of organised clouds become NaN, others are removed."""
+    _copy_table(pcd.read_header(path)[0], new, mask, rb"(?m)^(\s*(?:WIDTH|POINTS)\s+)\d+")
 
 
-def write_ply(job: FilterJob) -> Omissions:
-    """Copy a PLY file or folder; vertices are removed, or become NaN where other elements, such as
-    faces, may refer to them by their number."""
-
-    def filter_file(path: Path, new: Path, mask: Bool) -> None:
-        _copy_table(ply.read_layout(path), new, mask, _PLY_COUNTS)
-
-    return _write_files(job, ply.EXTENSIONS, filter_file)
+def filter_ply(path: Path, new: Path, mask: Bool) -> None:
+    """Copy a PLY file; vertices are removed, or become NaN where other elements, such as faces, may
+    refer to them by their number."""
+    _copy_table(ply.read_layout(path), new, mask, rb"(?m)^(\s*element\s+vertex\s+)\d+")
 
 
 def write_las(job: FilterJob) -> Omissions:
     """Copy a LAS or LAZ file or folder without some points; version, format and records stay."""
     ending = job.output.suffix.lower()
     packed = ending == ".laz" if job.source.is_file() and ending in las.EXTENSIONS else None
-    return _write_files(job, las.EXTENSIONS, partial(_filter_las, packed=packed))
+    return write_files(job, las.EXTENSIONS, partial(_filter_las, packed=packed))
 
 
-def _write_files(job: FilterJob, extensions: tuple[str, ...], filter_file: FilterFile) -> Omissions:
-    """Write the one file, or the folder, of a recording; files that were not read are left out."""
+def write_files(job: FilterJob, extensions: tuple[str, ...], filter_file: FilterFile) -> Omissions:
+    """Copy the one file, or the folder, of a recording; files that were not read are left out."""
     files = files_of(job.source, extensions)
     masks = dict(zip(files, job.scan_masks(len(files)), strict=True))
     if not job.source.is_file():

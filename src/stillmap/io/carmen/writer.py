@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.core.array_types import Bool, Float, Float32, Int64
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import RangeRule
@@ -17,7 +17,6 @@ from stillmap.io import laser_scan
 from stillmap.io.carmen.log import (
     BYTE_ORDER_MARK,
     SCAN_KINDS,
-    LaserLog,
     first_reading,
     flaser_config,
     read_log,
@@ -222,7 +221,13 @@ def write_filtered(job: FilterJob) -> Omissions:
     """
     recording = job.recording
     lasers, _ = select_scans(read_log([job.source], window=TimeWindow(job.options)))
-    scan_of = _number_lines(job, lasers)
+    none = np.empty(0, np.int64)
+    stamp_ns = np.concatenate([none, *(own.stamp_ns for own in lasers)])
+    order = np.argsort(stamp_ns, kind="stable")
+    if not np.array_equal(stamp_ns[order], recording.stamp_ns):
+        raise other_recording_error(job.source)
+    lines = np.concatenate([none, *(own.line for own in lasers)])[order]
+    scan_of = {number: t for t, number in enumerate(lines.tolist())}
     codes = [
         find_no_return_code(
             own.raw([np.empty((own.n_readings, 2))] * len(own.configs)).sample_readings(),
@@ -234,11 +239,13 @@ def write_filtered(job: FilterJob) -> Omissions:
     with write_atomically(job.output) as file:
         for line in read_lines(job.source):
             t = scan_of.get(line.number)
-            name = line.text.removeprefix(BYTE_ORDER_MARK).split(maxsplit=1)[:1]
+            text = line.text.removeprefix(BYTE_ORDER_MARK)
+            name = b"".join(text.split(maxsplit=1)[:1])
             if t is not None:
-                blank, code = job.blank[recording.beams_of(t)], codes[recording.sensor[t]]
-                file.write(_blank_readings(line.text, blank, code))
-            elif line.damage or (name and name[0] in SCAN_KINDS):
+                blank = np.flatnonzero(job.blank[recording.beams_of(t)]) + first_reading(name)
+                new = replace_words(text, dict.fromkeys(blank.tolist(), codes[recording.sensor[t]]))
+                file.write(line.text[: len(line.text) - len(text)] + new)
+            elif line.damage or name in SCAN_KINDS:
                 omitted += 1
             else:
                 file.write(line.text)
@@ -264,22 +271,3 @@ def find_no_return_code(readings: Float32, rule: RangeRule | None) -> bytes:
         return b"0.00"
     longest = max(float((rule and rule.threshold) or 0.0), float(readings.max(initial=0.0)))
     return f"{_OVERFLOW if longest < _OVERFLOW else 10.0 * longest:.2f}".encode("ascii")
-
-
-def _number_lines(job: FilterJob, lasers: list[LaserLog]) -> dict[int, int]:
-    """The scan of the recording by line number."""
-    if lasers:
-        stamp_ns = np.concatenate([own.stamp_ns for own in lasers])
-        order = np.argsort(stamp_ns, kind="stable")
-        if np.array_equal(stamp_ns[order], job.recording.stamp_ns):
-            line = np.concatenate([own.line for own in lasers])[order]
-            return {number: t for t, number in enumerate(line.tolist())}
-    raise other_recording_error(job.source)
-
-
-def _blank_readings(text: bytes, blank: Bool, code: bytes) -> bytes:
-    """A scan line with the readings `blank` (n,) replaced by the code."""
-    line = text.removeprefix(BYTE_ORDER_MARK)
-    first = first_reading(line.split(maxsplit=1)[0])
-    codes = {first + k: code for k in np.flatnonzero(blank).tolist()}
-    return text[: len(text) - len(line)] + replace_words(line, codes)

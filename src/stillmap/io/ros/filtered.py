@@ -46,34 +46,30 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
     kind, mcap = detect_kind(job.source)
     kind = cast(BagKind, job.kind) if job.kind else kind
     topics, scan_of = _number_scans(job)
-    count, left = dict.fromkeys(topics, 0), len(scan_of)
-    omitted = damaged = 0
+    count, omitted, damaged = dict.fromkeys(topics, 0), 0, 0
     total = max(sum(c.n_messages for c in bag.channels), 1)
     options = {"overwrite": job.overwrite, "mcap": mcap and kind == "ros2"}
     with new_bag(job.output, kind, **options) as copy:
         sends = {c.id: copy.copy_topic(c) for c in bag.channels}
         for number, message in enumerate(bag.messages({c.topic for c in bag.channels})):
-            channel, scan = message.channel, None
-            if channel.topic in topics:
-                count[channel.topic] += 1
-                scan = scan_of.get((channel.topic, count[channel.topic]))
+            (topic, channel), blank = (message.channel.topic, message.channel), None
+            if topic in topics:
+                count[topic] += 1
+                scan = scan_of.pop((topic, count[topic]), None)
                 if scan is None:  # it was not read
                     omitted += 1
                     continue
-                left -= 1
+                blank = job.blank[job.recording.beams_of(scan)]
             raw = _unpack(message)
-            if raw is None:
-                damaged += 1
-                continue
-            mask = None if scan is None else job.blank[job.recording.beams_of(scan)]
-            if mask is not None and mask.any():
-                raw = copy.serialize(_blank(message, mask, job), channel.type)
+            if raw is not None and blank is not None and blank.any():
+                raw = copy.serialize(_blank(message, blank, job), channel.type)
+            damaged += raw is None
             send = sends[channel.id]
-            if send is not None:
+            if send is not None and raw is not None:
                 send(message.log_ns, raw)
             if number % _PROGRESS_INTERVAL == 0:
                 job.report(min(number / total, 1.0))
-        if left:
+        if scan_of:
             raise other_recording_error(job.source)
     unknown = {c.topic for c in bag.channels if sends[c.id] is None and c.n_messages}
     unfiltered = {c.topic for c in bag.channels if c.type in SCAN_TYPES} - topics - unknown
