@@ -269,7 +269,7 @@ def change_e57_xml(data: bytes, change: Mutation) -> bytes:
     """An E57 file with another XML section, its last one, and valid checksums."""
     text = _e57_content(data)
     at = text.find(b"<?xml")
-    end = at + int.from_bytes(text[32:40], "little")
+    end = min(at + int.from_bytes(text[32:40], "little"), len(text))
     new = change(text[at:end]).ljust(end - at, b" ")
     text = text[:at] + new + text[end:]
     return _e57_pages(text[:32] + struct.pack("<Q", len(new)) + text[40:])
