@@ -51,10 +51,12 @@ def beam_angles(recording: Recording) -> Float:
         raise InputError("is 3D: a 2D recording is required", hint=_HINT)
     out = np.full((recording.n_scans, 2), np.nan)
     counts = np.diff(recording.offset)
-    known = {
-        number: {int(n): angles for n in np.unique(counts[recording.sensor == number])}
-        for number, angles in enumerate(map(_recorded_angles, _sensor_notes(recording)))
-    }
+    known: dict[int, dict[int, tuple[float, float]]] = {}
+    for number, notes in enumerate(_sensor_notes(recording)):
+        if notes.start_angle is not None and notes.angle_step is not None:
+            angles = notes.start_angle, notes.angle_step
+            sizes = np.unique(counts[recording.sensor == number]).tolist()
+            known[number] = dict.fromkeys(sizes, angles)
     undetermined = []
     for t in recording.iter_scans(range(recording.n_scans)):
         points = recording.points[recording.beams_of(t)].astype(np.float64)
@@ -75,7 +77,7 @@ def beam_angles(recording: Recording) -> Float:
     for t in undetermined:
         n = int(counts[t])
         full_turn = -np.pi, 2 * np.pi / max(n, 1)
-        out[t] = known[int(recording.sensor[t])].get(n) or full_turn
+        out[t] = known.get(int(recording.sensor[t]), {}).get(n, full_turn)
     return out
 
 
@@ -97,7 +99,8 @@ def range_limits(recording: Recording) -> list[RangeLimits]:
         length, is_hit = np.hypot(x, y), recording.hit[beams]
         hit[s] = max(hit[s], length.max(where=is_hit, initial=0.0))
         far[s] = max(far[s], length.max(where=~is_hit & ~np.isnan(length), initial=0.0))
-    recorded = [_range_threshold(entry) for entry in _sensor_notes(recording)]
+    rules = [notes.ranges for notes in _sensor_notes(recording)]
+    recorded = [0.0 if rule is None else max(rule.threshold or 0.0, 0.0) for rule in rules]
     return [
         RangeLimits(float(h), n or float(f) or None)
         for h, f, n in zip(hit, far, recorded, strict=True)
@@ -129,17 +132,6 @@ def _sensor_notes(recording: Recording) -> list[SensorNotes]:
     """Notes on each sensor, empty ones where there are none."""
     recorded, count = recording.source.sensors, len(recording.T_base_sensor)
     return recorded[:count] + [SensorNotes()] * (count - len(recorded))
-
-
-def _recorded_angles(notes: SensorNotes) -> tuple[float, float] | None:
-    if notes.start_angle is None or notes.angle_step is None:
-        return None
-    return notes.start_angle, notes.angle_step
-
-
-def _range_threshold(notes: SensorNotes) -> float | None:
-    value = None if notes.ranges is None else notes.ranges.threshold
-    return value if value is not None and value > 0.0 else None
 
 
 def _fits(angles: tuple[float, float], points: Float, usable: Index) -> bool:

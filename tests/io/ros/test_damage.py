@@ -155,7 +155,7 @@ def test_folders_whose_metadata_lacks_or_names_more(tmp_path):
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (b"#ROSBAG V1.2\n", "is a bag of version V1.2"),
+        (b"#ROSBAG V1.2\n", "version 2.0"),
         (b"#ROSBAG V2.0\n", "holds no scans"),
         (b"\x89MCAP0\r\n", "holds no scans"),
         (b"SQLite format 3\0" + bytes(100), "holds no scans"),

@@ -272,23 +272,17 @@ def _find_images(
         match = _CAMERA_FOLDER.fullmatch(place.name)
         if match is None or not place.is_dir():
             continue
+        inner = place / "data" if (place / "data").is_dir() else place
+        own = place / "timestamps.txt"
         try:
-            files = _list_images(place, times)
+            listed = list_files(inner, cameras.EXTENSIONS)
+            files = stamp_files(listed, read_times(own) if own.is_file() else times, place)
             camera = _make_camera(place.name, int(match[1]), files, calibration)
         except InputError as error:
             warnings.append(f"the images in {place.name} are ignored: {error}")
             continue
         parts.append(cameras.images_from_files(files, camera))
     return cameras.merge_images(parts) if parts else None, warnings
-
-
-def _list_images(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
-    """Stamps and files of the images of one camera."""
-    inner = place / "data" if (place / "data").is_dir() else place
-    files = list_files(inner, cameras.EXTENSIONS)
-    own = place / "timestamps.txt"
-    times = read_times(own) if own.is_file() else times
-    return stamp_files(files, times, place)
 
 
 def _make_camera(

@@ -260,11 +260,8 @@ def _open_file(path: Path, scratch: Path | None, trusted: bool, stack: ExitStack
                 raise DamagedBagError(str(error) or type(error).__name__) from error
             stack.callback(indexed.close)
             return indexed
-    if start.startswith(BAG1_MAGIC):
-        version = start[8:13].decode("ascii", "replace").strip()
-        hint = "`rosbag fix` or `rosbag reindex` of ROS 1 makes a V2.0 of it"
-        raise InputError(f"is a bag of version {version}", where=str(path), hint=hint)
-    raise InputError("is no bag, in spite of its name", where=str(path))
+    hint = "`rosbag fix` of ROS 1 makes version 2.0 of older bags"
+    raise InputError("is no bag of ROS 1 (version 2.0) or ROS 2", where=str(path), hint=hint)
 
 
 def _list_all_files(paths: Sequence[Path]) -> list[Path]:
