@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import IO, Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -280,7 +280,7 @@ def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) ->
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 # whatever the name: for EPS, Pillow starts Ghostscript
-_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM", "WEBP")
 
 # of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes 1 to 4
 _MAX_PIXELS = 64 << 20
@@ -300,7 +300,8 @@ def read_image_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: it is no image, or cannot be read.
     """
-    with _open_image(path) as image:
+    # given a path, Pillow maps files of bare pixels into memory
+    with InputFile(path) as file, open_image(file, str(path)) as image:
         return int(image.size[0]), int(image.size[1])
 
 
@@ -310,7 +311,7 @@ def read_image(path: Path) -> NDArray[Any]:
     Raises:
         InputError: it is no image, damaged, or cannot be read.
     """
-    with _open_image(path) as image:
+    with InputFile(path) as file, open_image(file, str(path)) as image:
         return to_array(image)
 
 
@@ -337,24 +338,24 @@ def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
 
 
 @contextmanager
-def _open_image(path: Path) -> Iterator[Image.Image]:
+def open_image(source: IO[bytes], where: str) -> Iterator[Image.Image]:
+    """Open an image.
+
+    Raises:
+        InputError: it is none, damaged, or too large.
+    """
     try:
-        if not path.is_file():
-            what = "is no file" if path.exists() else "is listed, but not there"
-            raise InputError(what, where=str(path))
         with warnings.catch_warnings():
             # an image that unpacks to more than memory
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             warnings.filterwarnings("ignore", category=UserWarning)
-            # given a path, Pillow maps files of bare pixels into memory
-            with InputFile(path) as file, Image.open(file, formats=_FORMATS) as image:
+            with Image.open(source, formats=_FORMATS) as image:
                 if image.size[0] * image.size[1] > _MAX_PIXELS:
-                    raise InputError("is too large an image", where=str(path))
+                    raise Image.DecompressionBombError
                 yield image
     except (*_DAMAGED, *_TOO_LARGE) as error:
-        what = (
-            "is too large an image" if isinstance(error, _TOO_LARGE) else "is no image, or damaged"
-        )
+        too_large = isinstance(error, _TOO_LARGE)
+        what = "is too large an image" if too_large else "is no image, or damaged"
         if isinstance(error, OSError) and error.strerror:
             what = f"cannot be read: {error.strerror}"
-        raise InputError(what, where=str(path)) from error
+        raise InputError(what, where=where) from error

@@ -16,7 +16,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.builder import RecordingBuilder
-from stillmap.io.trajectory import MAX_TRANSLATION
+from stillmap.io.trajectory import is_rigid
 from stillmap.prepare.lasers import RawLaser, RawLasers, unit_vectors
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 from stillmap.prepare.prepare import prepare
@@ -260,18 +260,10 @@ def poses_to_matrices(
         raise ValueError(f"{name}: expected {shapes}, got {_describe(array)}")
     require_length(name, len(array), count, like)
     array = array.astype(np.float64)
-    finite = np.isfinite(array).reshape(count, -1).all(axis=1)
-    require_all(name, finite, "finite numbers", array)
-    near = (np.abs(array) < MAX_TRANSLATION).all(axis=tuple(range(1, array.ndim)))
-    require_all(name, near, f"numbers below {MAX_TRANSLATION:g}", array)
-    if flat:
-        return se2.matrix(*array.T)
-    R = array[:, :dimension, :dimension]
-    skew = np.abs(R @ R.swapaxes(1, 2) - np.eye(dimension)).reshape(count, -1).max(axis=1)
-    last_row = np.abs(array[:, dimension] - np.eye(size)[dimension]).max(axis=1)
-    good = (skew < _MAX_SKEW) & (np.linalg.det(R) > 0.0) & (last_row < _MAX_SKEW)
-    require_all(name, good, "rigid transforms", array)
-    return array
+    with np.errstate(invalid="ignore"):
+        T = se2.matrix(*array.T) if flat else array
+    require_all(name, is_rigid(T, _MAX_SKEW), "rigid transforms", array)
+    return T
 
 
 def _describe(array: NDArray[Any]) -> str:

@@ -27,7 +27,7 @@ from stillmap.io.builder import (
 )
 from stillmap.io.registry import Format, detect_format
 from stillmap.io.text_lines import Progress
-from stillmap.io.trajectory import MAX_MOUNT, are_rigid
+from stillmap.io.trajectory import MAX_MOUNT, is_rigid
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.prepare import complete, interpret
 from stillmap.prepare.time_window import TimeWindow, select_time
@@ -133,7 +133,7 @@ def require_mounts(recording: Recording, where: str) -> None:
     for sensor in np.unique(recording.sensor).tolist():
         mount = recording.T_base_sensor[sensor]
         distance = float(np.hypot.reduce(mount[:D, D]))
-        if not np.isfinite(mount).all() or not are_rigid(mount[None]):
+        if not is_rigid(mount[None]).all():
             raise InputError(f"the mount of sensor {sensor} is no rigid transform", where=where)
         if not distance <= MAX_MOUNT:
             what = f"sensor {sensor} is mounted {distance:.4g} m from the robot's base"
@@ -150,7 +150,7 @@ def require_plausible(recording: Recording, where: str) -> None:
     require_mounts(recording, where)
     if np.any(recording.stamp_ns[1:] < recording.stamp_ns[:-1]):
         raise InputError("stamps must not fall", where=where, hint="sort the scans by time")
-    if recording.T_odom_base is not None and not are_rigid(recording.T_odom_base):
+    if recording.T_odom_base is not None and not is_rigid(recording.T_odom_base).all():
         what = "odometry: expected finite rigid transforms within a million km"
         raise InputError(what, where=where, hint="odometry=False does without")
 

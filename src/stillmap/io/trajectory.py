@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stillmap.core import se2
-from stillmap.core.array_types import Float, Int64
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
@@ -51,15 +51,17 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> Float:
     return T
 
 
-def are_rigid(T: Float) -> bool:
-    """True if all of (N, D+1, D+1) matrices are rigid transforms within the tolerance."""
+def is_rigid(T: Float, tolerance: float = _UNIT_TOLERANCE) -> Bool:
+    """(N,) mask of the matrices (N, D+1, D+1) that are rigid transforms within a tolerance."""
     D = T.shape[-1] - 1
-    R, t = T[:, :D, :D], T[:, :D, D]
-    if not ((np.abs(R) <= 1.0 + _UNIT_TOLERANCE).all() and (np.abs(t) < MAX_TRANSLATION).all()):
-        return False
-    is_orthogonal = np.abs(R @ R.swapaxes(1, 2) - np.eye(D)) <= _UNIT_TOLERANCE
-    is_affine = (np.abs(T[:, D] - np.eye(D + 1)[D]) <= _UNIT_TOLERANCE).all()
-    return bool(is_orthogonal.all() and is_affine and (np.linalg.det(R) > 0.0).all())
+    with np.errstate(invalid="ignore", over="ignore"):
+        is_near = (np.abs(T[:, :D, D]) < MAX_TRANSLATION).all(axis=1)
+        is_bounded = (np.abs(T[:, :D, :D]) <= 1.0 + tolerance).all(axis=(1, 2))
+        near = np.asarray(is_near & is_bounded)
+        R = np.where(near[:, None, None], T[:, :D, :D], np.nan)
+        skew = np.abs(R @ R.swapaxes(1, 2) - np.eye(D)).max(axis=(1, 2))
+        is_affine = (np.abs(T[:, D] - np.eye(D + 1)[D]) <= tolerance).all(axis=1)
+        return np.asarray((skew <= tolerance) & is_affine & (np.linalg.det(R) > 0.0))
 
 
 def pose_from_row(row: ArrayLike) -> Float:

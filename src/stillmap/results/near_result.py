@@ -12,7 +12,7 @@ from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import Shift, find_origin, shift, shift_poses
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.trajectory import are_rigid, read_tum
+from stillmap.io.trajectory import is_rigid, read_tum
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.results.folder import ResultFolder
 from stillmap.results.point_cloud import Block, cloud_from_folder
@@ -88,7 +88,7 @@ class NearResult(ShortRepr):
         poses = [read_tum(path)[1] for path in ([single] if single.exists() else every)]
         if extended.exists():
             route = open_npy(extended)
-            if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not are_rigid(route):
+            if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not is_rigid(route).all():
                 raise InputError("holds no poses", where=str(extended))
             poses.append(route)
         if not sum(map(len, poses)):

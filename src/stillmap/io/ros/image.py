@@ -2,20 +2,18 @@
 
 import io
 import re
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.cameras import to_array
+from stillmap.io.cameras import open_image, to_array
 from stillmap.io.ros.bag import Bag
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
@@ -28,7 +26,6 @@ from stillmap.io.ros.messages import (
 from stillmap.io.ros.tf import TransformTree
 from stillmap.io.trajectory import rigid_transform
 
-_MAX_PIXELS = 1 << 27
 _RAW = {  # encoding: type, channels, indices of red, green and blue
     "rgb8": ("u1", 3, (0, 1, 2)),
     "rgba8": ("u1", 4, (0, 1, 2)),
@@ -153,7 +150,8 @@ def decode_pixels(message: Any, compressed: bool) -> NDArray[Any]:
         InputError: it is damaged, too large, or of an unknown encoding.
     """
     if compressed:
-        return _decompress(bytes(message.data))
+        with open_image(io.BytesIO(bytes(message.data)), "an image") as image:
+            return to_array(image)
     height, width, step = int(message.height), int(message.width), int(message.step)
     encoding = str(message.encoding)
     kind, channels, order = _RAW.get(encoding, ("u1", 1, None))
@@ -169,15 +167,6 @@ def decode_pixels(message: Any, compressed: bool) -> NDArray[Any]:
         return _demosaic(values[..., 0], _BAYER[encoding])
     chosen = values[..., 0] if order is None else values[..., list(order)]
     return np.ascontiguousarray(chosen, dtype.newbyteorder("="))
-
-
-def _decompress(data: bytes) -> NDArray[Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP", "TIFF")) as image:
-            if image.width * image.height > _MAX_PIXELS:
-                raise InputError("an image is too large")
-            return to_array(image)
 
 
 def _demosaic(values: NDArray[Any], pattern: str) -> NDArray[Any]:
