@@ -164,7 +164,7 @@ def thin(log: Log, rng: Rng, every: int) -> Log:
     return log.part(~log.scan | (number % every == 0))
 
 
-def take_steps(log: Log, rng: Rng, change: Callable[[Float, Float, Rng], Float]) -> Log:
+def drive(log: Log, rng: Rng, change: Callable[[Float, Float, Rng], Float]) -> Log:
     """Other odometry: `change` of its steps (K, 3), each up to one of the stamps (K,)."""
     order = np.argsort(log.stamp, kind="stable")
     first, T = log.pose[order[0]], se2.matrix(*log.pose[order].T)
@@ -176,11 +176,6 @@ def take_steps(log: Log, rng: Rng, change: Callable[[Float, Float, Rng], Float])
     pose = np.empty_like(log.pose)
     pose[order] = np.column_stack([first[0] + np.cumsum(x), first[1] + np.cumsum(y), theta])
     return log._replace(pose=pose)
-
-
-def scale(log: Log, _rng: Rng, by: float) -> Log:
-    """Odometry that counts so many times the way."""
-    return log._replace(pose=log.pose * (by, by, 1.0))
 
 
 def freeze(steps: Float, stamp: Float, rng: Rng) -> Float:
@@ -218,12 +213,11 @@ CHANGES: dict[str, Callable[[Log, Rng], Log | list[Log]]] = {
     **{f"every-{k}": partial(thin, every=k) for k in (2, 3, 4, 5)},
     **{f"fov-{k}": lambda log, _, k=k: log._replace(fov=math.radians(k)) for k in (180, 120, 90)},
     **{f"range-{k}": lambda log, _, k=k: log._replace(reach=float(k)) for k in (12, 8, 5)},
-    **{f"scale-{k}": partial(scale, by=k) for k in (0.9, 1.1)},
-    "frozen": partial(take_steps, change=freeze),
-    "no-direction": partial(  # ways back count as ways ahead
-        take_steps, change=lambda steps, *_: np.c_[np.abs(steps[:, 0]), steps[:, 1:]]
-    ),
-    "no-rotation": partial(take_steps, change=lambda steps, *_: steps * (1.0, 1.0, 0.0)),
+    **{f"scale-{k}": partial(drive, change=lambda s, *_, k=k: s * (k, k, 1)) for k in (0.9, 1.1)},
+    "frozen": partial(drive, change=freeze),
+    # ways back count as ways ahead
+    "no-direction": partial(drive, change=lambda s, *_: np.where([1, 0, 0], np.abs(s), s)),
+    "no-rotation": partial(drive, change=lambda s, *_: s * (1.0, 1.0, 0.0)),
     "late-odometry": delay_odometry,
     **{f"pieces-{k}": partial(cut, pieces=k) for k in (2, 3, 4, 5)},
 }
@@ -258,10 +252,9 @@ def run(job: Job) -> dict[str, Any]:
         except RuntimeError as error:
             print(error, flush=True)
             return {**row, "status": "DEFECT"}
-    row["cpu"] = round(done.cpu, 1)
     if done.status == merging.REFUSED:
-        return {**row, "status": "refused"}
-    return {**row, "status": "done", **score(job, log, logs)}
+        return {**row, "status": "refused", "cpu": round(done.cpu, 1)}
+    return {**row, "status": "done", "cpu": round(done.cpu, 1), **score(job, log, logs)}
 
 
 def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
@@ -274,9 +267,7 @@ def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
     steps = [_largest_step(one, log) for one in (now, then)]
     worst = (a.max, b.max, TEAR_METRES) if len(relations) else (*steps, TEAR_STEP)
     doubts = json.loads((job.result() / "run.json").read_text()).get("doubts", {})
-    sessions = job.result() / "sessions.json"
-    pieces = json.loads(sessions.read_text()) if sessions.exists() else []
-    apart = [*doubts.get("beside_the_map_from", []), *(p for p in pieces if not p["accepted"])]
+    left_out = sum(not np.isin(log.was[log.scan], now[:, 0]).any() for log in logs)
     return {
         "scans": len(now),
         "relations": len(relations),
@@ -287,7 +278,7 @@ def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
         "step": round(steps[0], 3),
         "tear": int(worst[0] > max(worst[2], TEAR_FACTOR * worst[1])),
         "breaks": len(doubts.get("carried_before", [])),
-        "apart": len(apart),
+        "apart": len(doubts.get("beside_the_map_from", [])) + left_out,
     }
 
 
