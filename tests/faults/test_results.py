@@ -163,9 +163,7 @@ def checkpoint(interrupted, tmp_path) -> Path:
     return tmp_path / "in" / ".out.resume" / "iteration-2"
 
 
-@pytest.mark.parametrize(
-    "name", ["checkpoint.json", "state.best.m_step.poses.npy", "state.best.e_step.p_static.npy"]
-)
+@pytest.mark.parametrize("name", ["checkpoint.json", "0.npy", "1.npy"])
 @pytest.mark.parametrize(
     "fault",
     [pytest.param(one, marks=() if one is be_pipe else pytest.mark.slow) for one in BEFORE],

@@ -23,7 +23,7 @@ UNKNOWN, VIOLET = (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
-_STRIP = 1 << 20  # cells drawn at once
+_STRIP = 1 << 16  # cells drawn at once
 _MAX_MARGIN = 500  # cells around pictures of long, narrow maps
 _DOT_WIDTH = 600  # pixels of image width per pixel of dot size
 
