@@ -19,7 +19,7 @@ N = 16  # beams
 _LASER = SensorNotes(
     start_angle=-1.0,
     angle_step=2.0 / (N - 1),
-    ranges=RangeRule(20.0, "", "unusable", "", None, "", 0.0),
+    ranges=RangeRule(20.0, "", "unusable", None, 0.0),
 )
 
 

@@ -46,7 +46,7 @@ def test_mapped_range(dimension, cell, max_range, reach):
 )
 def test_what_is_said_of_the_laser_is_believed(how, stated):
     recording = scan([5.0], [True])
-    rule = RangeRule(250.0, how, "unusable", "", None, "", 0.0)
+    rule = RangeRule(250.0, how, "unusable", None, 0.0)
     recording.source.sensors = [SensorNotes(ranges=rule)]
     assert stated_max_range(recording) == stated
 

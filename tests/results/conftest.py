@@ -153,7 +153,7 @@ def _count(poses, points, hit, e):
     return OccupancyMap(p, ORIGIN, RESOLUTION, alpha, beta)
 
 
-RULE = RangeRule(12.0, "12 m repeats (919 x)", "unusable", "", 12.0, "", 0.0)
+RULE = RangeRule(12.0, "12 m repeats (919 x)", "unusable", 12.0, 0.0)
 SOURCE = {
     "path": "logs/hall <1>.clf",
     "format": "CARMEN FLASER",

@@ -49,9 +49,7 @@ class RangeRule:
     threshold: float | None = None
     threshold_how: str = ""
     zero_means: Literal["unusable", "max-range"] = "unusable"
-    zero_how: str = ""
     free_range: float | None = None  # None: unknown, maximum-range beams are unusable
-    free_how: str = ""
     min_range: float = 0.0
     # first and last beam, maximum range of returns from the robot itself
     self_filter: tuple[tuple[int, int, float], ...] = ()

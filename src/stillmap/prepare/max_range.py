@@ -143,16 +143,14 @@ def infer_range_rule(
         or no_return.mean() > MIN_ZERO_SHARE
     )
     share = float(no_return.mean()) if coded and ranges.size else 0.0
-    zero_means, zero_how = _zero_meaning(ranges, share, options.zero_means)
+    zero_means = _zero_meaning(ranges, share, options.zero_means)
     is_hit = (ranges >= np.float32(max(options.min_range, MAX_ZERO_RANGE))) & ~no_return
-    free, free_how = _free_range(ranges[is_hit], threshold, options.free_range)
+    free = options.free_range or _free_range(ranges[is_hit], threshold)
     sectors: tuple[SelfSector, ...] = ()
     if options.self_filter:
         min_range = max(options.min_range, MAX_ZERO_RANGE)
         sectors = find_self_sectors(np.atleast_2d(ranges), min_range)
-    rule = RangeRule(
-        threshold, how, zero_means, zero_how, free, free_how, options.min_range, sectors
-    )
+    rule = RangeRule(threshold, how, zero_means, free, options.min_range, sectors)
     if free is None:
         warnings.append(
             advise(
@@ -165,36 +163,25 @@ def infer_range_rule(
 
 def _zero_meaning(
     ranges: Float32, no_return_share: float, option: Literal["auto", "unusable", "max-range"]
-) -> tuple[Literal["unusable", "max-range"], str]:
+) -> Literal["unusable", "max-range"]:
     """Meaning of zero, where a share of the readings has another value for no return."""
     if option != "auto":
-        return option, GIVEN
+        return option
     share = float(np.mean((ranges >= 0.0) & (ranges < MAX_ZERO_RANGE))) if ranges.size else 0.0
-    text = f"{100.0 * share:.2f} % of the readings are zero"
-    if no_return_share > 0.0 and share <= MIN_ZERO_RATIO * no_return_share:
-        return "unusable", f"{text}; no return has its own value"
-    if share > MIN_ZERO_SHARE:
-        rest = "hardly any other" if no_return_share > 0.0 else "no other"
-        return "max-range", f"{text} and {rest} value stands for no return"
-    return "unusable", text
+    least = MIN_ZERO_RATIO * no_return_share
+    return "max-range" if share > max(MIN_ZERO_SHARE, least) else "unusable"
 
 
-def _free_range(
-    hits: Float32, threshold: float | None, option: float | None
-) -> tuple[float | None, str]:
+def _free_range(hits: Float32, threshold: float | None) -> float | None:
     """Range up to which a maximum-range beam is free.
 
     A code of 81.91 m shows no 81.91 m of free space on a laser that detects obstacles up to 20 m:
     the 99.9 % quantile of its hits, at most the threshold.
     """
-    if option is not None:
-        return option, GIVEN
     if hits.size == 0:
-        return threshold, "the maximum range: there are no hits"
+        return threshold
     seen = _decimal(np.quantile(hits, FREE_QUANTILE, method="lower"))
-    if threshold is not None and threshold <= seen:
-        return threshold, "the maximum range"
-    return seen, f"{100.0 * FREE_QUANTILE:g} % of the hits are nearer"
+    return seen if threshold is None else min(seen, threshold)
 
 
 def apply_range_rule(ranges: Float32, rule: RangeRule) -> tuple[Float32, Bool]:

@@ -2,9 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-
-from stillmap.core.array_types import Bool, Int64
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -51,12 +48,6 @@ class TimeWindow:
         self.selected += inside
         self.omitted += not inside
         return inside
-
-    def select_all(self, stamp_ns: Int64) -> Bool:
-        """(T,) whether scans with stamps (T,) are to be read; times count from the smallest."""
-        if len(stamp_ns) and self._origin_ns is None:
-            self._origin_ns = int(stamp_ns.min())
-        return np.array([self.select(stamp) for stamp in stamp_ns.tolist()], np.bool_)
 
     def contains(self, stamp_ns: int) -> bool:
         """True if something with a stamp, an image say, lies inside; not counted."""
@@ -113,13 +104,12 @@ def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Re
     Raises:
         InputError: there is no such scan.
     """
-    inside = window.select_all(recording.stamp_ns)
+    scans = [t for t, stamp in enumerate(recording.stamp_ns.tolist()) if window.select(stamp)]
     window.require_scans(where)
-    scans = np.flatnonzero(inside)
-    if not len(scans):
+    if not scans:
         return recording
     return replace(
-        recording.slice_scans(int(scans[0]), int(scans[-1]) + 1),  # stamps do not decrease
+        recording.slice_scans(scans[0], scans[-1] + 1),  # stamps do not decrease
         images=window.select_images(recording.images),
         source=replace(recording.source, part=window.part or recording.source.part),
     )

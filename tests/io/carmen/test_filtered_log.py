@@ -112,7 +112,7 @@ def test_another_log_is_refused(made, log, flaser, tmp_path):
 
 
 def rule(threshold=None, zero="unusable", free=20.0):
-    return RangeRule(threshold, "", zero, "", free, "", 0.0)
+    return RangeRule(threshold, "", zero, free, 0.0)
 
 
 @pytest.mark.parametrize(
