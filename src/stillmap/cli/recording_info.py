@@ -12,9 +12,11 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
 
 _MAX_SAMPLE = 1 << 24  # beams used for quantiles of ranges
-_TABLES = ("skipped", "skipped_odometry", "damage", "records", "ignored", "params", "read_options")
-_LISTS = ("duplicates", "warnings", "topics", "self_filter")
-_WORDS = ("path", "format", "base_frame", "base_frame_how")
+_NOTES = (
+    *("path", "format", "base_frame", "base_frame_how", "skipped_unit", "skipped"),
+    *("skipped_odometry", "damage", "records", "ignored", "params", "read_options"),
+    *("duplicates", "warnings", "topics", "self_filter"),
+)
 _SENSOR_NOTES = (
     *("name", "beams_per_scan", "start_angle", "angle_step", "ranges"),
     *("upside_down", "upside_down_how", "frame"),
@@ -24,7 +26,7 @@ _SENSOR_NOTES = (
 def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
     source, times = recording.source, recording.beam_time
-    notes = to_jsonable(source.to_dict())
+    notes = to_jsonable(asdict(source))
     return {
         "dimension": recording.dimension,
         "scans": recording.n_scans,
@@ -33,7 +35,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "counts": _count_beams(recording),
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
-        "part": notes.get("part") or {},
+        "part": to_jsonable(source.to_dict().get("part") or {}),
         "beam_times_s": [float(times.min()), float(times.max())]
         if times is not None and len(times)
         else None,
@@ -42,10 +44,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "recorded_poses": _summarize_path(recording.T_recorded_base),
         "images": _summarize_images(recording),
         "sensors": _summarize_sensors(recording),
-        "skipped_unit": source.skipped_unit,
-        **{key: notes.get(key) or {} for key in _TABLES},
-        **{key: notes.get(key) or [] for key in _LISTS},
-        **{key: notes.get(key) for key in _WORDS},
+        **{key: notes[key] for key in _NOTES},
     }
 
 

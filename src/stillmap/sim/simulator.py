@@ -124,10 +124,8 @@ def _record(
     episode, T, dimension = world.episode, len(world.robot), sensor.dimension
     has_things, offset = episode.has_standing_things, [0]
     points = ArrayBuilder(np.float32, (dimension,), scratch)
-    types = {"hit": np.bool_, "static": np.bool_, "mover": np.int32, "thing": np.int32}
-    beams = {
-        name: ArrayBuilder(t, (), scratch) for name, t in (*types.items(), ("time", np.float32))
-    }
+    types = {"hit": "?", "static": "?", "mover": "i4", "thing": "i4", "time": "f4"}
+    beams = {name: ArrayBuilder(dtype, (), scratch) for name, dtype in types.items()}
     for scan in range(T):
         pattern = sensor.pattern(scan)
         exact = sensor.cast_rays(world, pattern, scan)
