@@ -7,7 +7,7 @@ from stillmap.core import se2
 from stillmap.sim import simulate
 from stillmap.sim.options import CrowdOptions, HeightOptions, LidarOptions, RobotOptions
 from stillmap.sim.scene import Scene
-from stillmap.sim.walls import Opening, box, pillar, wall
+from stillmap.sim.walls import box, pillar, wall
 from stillmap.slam import deskew_recording
 from stillmap.slam.options import SlamOptions
 
@@ -21,15 +21,15 @@ AND_BACK = ((17.0, 4.4), (11.0, 4.4))
 def run_through_rooms(thing, route, scans, seed, people=5):
     """A recording of a lidar of 16 channels, and its truth."""
     walls = [
-        *wall((0, 0), 14, "south", [Opening(3, 1.5, 0.4)]),
-        *wall((0, 9), 14, "north", [Opening(8, 2, 0.6)]),
-        *wall((0, 0), 9, "west", [Opening(5.5, 1.2, 0.3)]),
-        *wall((DOOR, 0), 9, "east", [Opening(3.5, 1.8, is_open=True)]),
+        *wall((0, 0), 14, "south", [(3, 1.5, 0.4)]),
+        *wall((0, 9), 14, "north", [(8, 2, 0.6)]),
+        *wall((0, 0), 9, "west", [(5.5, 1.2, 0.3)]),
+        *wall((DOOR, 0), 9, "east", [(3.5, 1.8, 0.2, True)]),
         *[(DOOR, y, DOOR + 0.2, y) for y in (3.5, 5.3)],
-        *wall((14.2, -3), 12, "south", [Opening(7, 2.0, 0.5)]),
-        *wall((14.2, 10), 12, "north", [Opening(2, 1.0, 0.3)]),
-        *wall((14.2, -3), 13, "west", [Opening(6.5, 1.8, is_open=True)]),
-        *wall((26.2, -3), 13, "east", [Opening(8, 1.2, 0.4)]),
+        *wall((14.2, -3), 12, "south", [(7, 2.0, 0.5)]),
+        *wall((14.2, 10), 12, "north", [(2, 1.0, 0.3)]),
+        *wall((14.2, -3), 13, "west", [(6.5, 1.8, 0.2, True)]),
+        *wall((26.2, -3), 13, "east", [(8, 1.2, 0.4)]),
         *pillar(6.5, 4.2, 0.3, 10),
         *pillar(19.5, 1.0, 0.35, 10),
     ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.sim.planner import FreeSpace, Planner, compute_segment_distance
-from stillmap.sim.walls import Opening, box, polyline, wall
+from stillmap.sim.walls import box, polyline, wall
 
 
 def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit():
@@ -42,8 +42,8 @@ def test_only_the_part_that_can_be_reached_counts():
 
 
 def test_a_room_behind_an_open_door_can_be_entered_and_a_niche_cannot():
-    door = Opening(4.0, is_open=True)
-    walls = [*wall((0, 0), 10, "south", [door, Opening(7.0)]), *box(5, 5, 10, 10)[1:]]
+    door = (4.0, 1.0, 0.2, True)
+    walls = [*wall((0, 0), 10, "south", [door, (7.0, 1.0, 0.2)]), *box(5, 5, 10, 10)[1:]]
     walls += polyline([(4, -0.2), (2, -0.2), (2, -3.2), (8, -3.2), (8, -0.2), (5, -0.2)])
     inside = np.array([3.0, -2.0])
     planner = Planner(FreeSpace(np.array(walls)), np.array([5.0, 5.0]), 0.36)

@@ -5,7 +5,6 @@ sensor made the result.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,24 +14,9 @@ from stillmap.em import OccupancyMap, final_labels
 from stillmap.mapping.projection import count_small_pieces
 from stillmap.slam import rematching, surface_agreement
 
-
-class _Scale(NamedTuple):
-    """Values at which a part of geometry is 50, and the displacement where nothing is seen again.
-
-    Attributes:
-        disagreement: m, between poses and scans matched anew; these err less in 3D.
-        displacement: m, of surfaces seen again.
-        unseen: m, that counts where no place is seen again, so that nothing confirms the map.
-        small_pieces: of the map, per 100 m2.
-    """
-
-    disagreement: float
-    displacement: float
-    unseen: float
-    small_pieces: float
-
-
-_SCALE = {2: _Scale(0.2, 0.03, 0.06, 30.0), 3: _Scale(0.03, 0.06, 0.03, 10.0)}  # by dimension
+# by dimension: disagreement and displacement in m and small pieces per 100 m2 at which that part of
+# geometry is 50, and the displacement that counts where nothing is seen again to confirm the map
+_SCALE = {2: (0.2, 0.03, 30.0, 0.06), 3: (0.03, 0.06, 10.0, 0.03)}
 # what the best of simulated results reach: it is 100
 _BEST_F1, _BEST_GEOMETRY = 0.85, 0.8
 _JUDGED_SCANS = 120  # at a time: longer and the poses matched anew have drifted
@@ -137,13 +121,11 @@ def _grade(evidence: QualityEvidence, dimension: int) -> Quality:
     geometry = overall = None
     labels = None if evidence.expected_f1 is None else _to_percent(evidence.expected_f1, _BEST_F1)
     if evidence.small_pieces is not None:
-        scale, displacement = _SCALE[dimension], evidence.displacement
-        parts = [
-            (scale.unseen if displacement is None else displacement) / scale.displacement,
-            evidence.small_pieces / scale.small_pieces,
-        ]
+        disagreement, displacement, small_pieces, unseen = _SCALE[dimension]
+        apart = unseen if evidence.displacement is None else evidence.displacement
+        parts = [apart / displacement, evidence.small_pieces / small_pieces]
         if evidence.disagreement is not None:
-            parts.append(evidence.disagreement / scale.disagreement)
+            parts.append(evidence.disagreement / disagreement)
         mean = float(np.prod([1.0 / (1.0 + part) for part in parts])) ** (1.0 / len(parts))
         geometry = _to_percent(mean, _BEST_GEOMETRY)
     if labels is None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 from stillmap.sim.scene import Point, Segment
 
@@ -15,22 +15,6 @@ _AXES: dict[Side, tuple[Point, Point]] = {
     "west": ((0.0, 1.0), (-1.0, 0.0)),
     "east": ((0.0, 1.0), (1.0, 0.0)),
 }
-
-
-class Opening(NamedTuple):
-    """A piece of a wall that steps back.
-
-    Attributes:
-        start: metres along the wall.
-        width: metres.
-        depth: metres; how far the closed door stands back, or how thick the open doorway is.
-        is_open: a doorway without a door: nothing closes it.
-    """
-
-    start: float
-    width: float = 1.0
-    depth: float = 0.2
-    is_open: bool = False
 
 
 def polyline(points: Sequence[Point], closed: bool = False) -> list[Segment]:
@@ -61,21 +45,26 @@ def locate(start: Point, side: Side, along: float, out: float = 0.0) -> Point:
 
 
 def wall(
-    start: Point, length: float, side: Side, openings: Iterable[Sequence[Any]] = ()
+    start: Point, length: float, side: Side, openings: Iterable[Sequence[float]] = ()
 ) -> list[Segment]:
-    """A straight wall along +x or +y whose openings step back to `side`, in ascending order.
+    """A straight wall along +x or +y whose openings step back to `side`.
 
-    Each opening is an `Opening`, or a row of its values.
+    Args:
+        start: of the wall.
+        length: of the wall.
+        side: where its back is.
+        openings: (begin, width, depth) of each along the wall, ascending, in metres, and a fourth
+            value, true, of those without a wall behind.
     """
     segments: list[Segment] = []
     line = [locate(start, side, 0.0)]
-    for o in (Opening(*row) for row in openings):
-        end = o.start + o.width
-        line += [locate(start, side, o.start), locate(start, side, o.start, o.depth)]
-        if o.is_open:
+    for begin, width, depth, *is_open in openings:
+        end = begin + width
+        line += [locate(start, side, begin), locate(start, side, begin, depth)]
+        if is_open:
             segments += polyline(line)
             line = []
-        line += [locate(start, side, end, o.depth), locate(start, side, end)]
+        line += [locate(start, side, end, depth), locate(start, side, end)]
     segments += polyline([*line, locate(start, side, length)])
     return [s for s in segments if s[:2] != s[2:]]
 
