@@ -144,7 +144,7 @@ def test_before_the_first_scan_and_after_the_end(corridor, tmp_path):
     mapper = LiveMapper({"threads": 1})
     assert mapper.poses.shape == mapper.path.shape == (0, 3, 3)
     assert mapper.map.p_occupied.size == len(mapper.cells.cells) == 0
-    calls = [mapper.finish, lambda: mapper.save(tmp_path / "out"), lambda: mapper.objects]
+    calls = [mapper.finish, lambda: mapper.save(tmp_path / "out")]
     for call in calls:
         with pytest.raises(InputError, match="no scan"):
             call()

@@ -23,15 +23,11 @@ def test_what_is_declared_is_what_is_read():
     assert read(defaults={"resolution": 0.1}, resolution=0.2).resolution == 0.2
 
 
-def test_one_topic_or_several():
+def test_one_topic_or_several_and_whole_numbers():
     assert read(scan_topic="/scan").scan_topic == ("/scan",)
-    found = read(scan_topic=["front", "rear"], laser_pose=[0, 0, 0, 1, 0, 3.14])
-    assert found.scan_topic == ("front", "rear")
-    assert found.laser_pose == (0.0, 0.0, 0.0, 1.0, 0.0, 3.14)
-
-
-def test_a_whole_number_is_a_number():
-    assert read(map_update_interval=2).map_update_interval == 2.0
+    given = read(scan_topic=["front", "rear"], laser_pose=[0, 0, 0, 1, 0, 3.14])
+    assert given.scan_topic == ("front", "rear")
+    assert given.laser_pose == (0.0, 0.0, 0.0, 1.0, 0.0, 3.14)
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,9 @@ class Fleet(NamedTuple):
     def failed(self) -> int:
         """How many recordings and places failed."""
         merged = [place.outcome for place in self.places if place.outcome is not None]
-        return sum(not one.is_done for one in [*(job.outcome for job in self.jobs), *merged])
+        return sum(
+            not outcome.is_done for outcome in [*(job.outcome for job in self.jobs), *merged]
+        )
 
     def to_list(self) -> list[dict[str, Any]]:
         """The content of `fleet.json`: an entry for each recording."""
@@ -165,7 +167,7 @@ def _require_fleet(root: str) -> None:
             return
         if not fs.isdir(path):
             raise InputError("is in the way: not a folder", where=root)
-        names = {str(one).rstrip("/").rpartition("/")[2] for one in fs.ls(path, detail=False)}
+        names = {str(entry).rstrip("/").rpartition("/")[2] for entry in fs.ls(path, detail=False)}
     if names - {RESULTS, PLACES, LIST, PAGE, _LOCK, path.rpartition("/")[2]}:
         hint = "choose another; a fleet's own folder is continued"
         raise InputError("already holds something", where=root, hint=hint)
@@ -203,7 +205,7 @@ def _known_names(root: str) -> dict[str, str]:
     folder = f"{path}/{RESULTS}"
     with explain(root, "read"):
         paths = fs.ls(folder, detail=False) if fs.isdir(folder) else []
-    names = [str(one).rstrip("/").rpartition("/")[2] for one in paths]
+    names = [str(path).rstrip("/").rpartition("/")[2] for path in paths]
     known = {name: read_made(root, f"{RESULTS}/{name}") for name in names if is_folder_name(name)}
     return {made.input: name for name, made in known.items() if made is not None}
 

@@ -251,5 +251,7 @@ def _summarize(folder: Path) -> dict[str, Any]:
         "warnings": [what for what, todo in warnings if todo],
         "notes": [what for what, todo in warnings if not todo],
         "map": picture,
-        "sessions": [{key: one.get(key) for key in ("name", "accepted", "why")} for one in listed],
+        "sessions": [
+            {key: session.get(key) for key in ("name", "accepted", "why")} for session in listed
+        ],
     }

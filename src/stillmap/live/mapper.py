@@ -33,7 +33,6 @@ from stillmap.live.update import Update
 from stillmap.pipeline.options import Options, adopt_cells, resolve_resolution
 from stillmap.prepare.plausibility import mapped_range, shorten_far_beams
 from stillmap.results.result import Result, to_options
-from stillmap.tracking import MovingObject
 
 Mode = Literal["localise", "extend"]
 
@@ -188,12 +187,6 @@ class LiveMapper:
         """m, edge of the cells in which `Update.changes` are, once a scan was pushed."""
         begun = self._mapping
         return self.options.slam.resolution if begun is None else begun.resolution
-
-    @property
-    def objects(self) -> list[MovingObject]:
-        """Moving objects, from the labels and poses of all scans so far."""
-        mapping = self.snapshot().build().mapping
-        return [] if mapping is None else mapping.objects
 
     def save(
         self,

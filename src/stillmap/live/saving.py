@@ -73,10 +73,6 @@ class Snapshot(ShortRepr):
     folder: Path | None = None
     kept_map: KeptMap | None = None
 
-    def build(self, progress: Progress = no_progress) -> Result:
-        """Labels, map and objects of the scans that are in the map, at these poses."""
-        return Result.of(self._take(self._find_submaps()[0])._map(progress))
-
     def refine(self, progress: Progress = no_progress) -> Result:
         """The result of `stillmap.build` on all scans: poses, too."""
         return Result.of(self._map(progress, refine=True))

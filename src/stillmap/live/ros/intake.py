@@ -31,8 +31,8 @@ SET_BACK = "clock set back"
 
 _FIRST_ODOMETRY = 2.0  # s for which the first scan waits for odometry
 _SILENCE = 1.0  # s after which nobody waits for a laser any more
-_LEAP_NS = 5 * 10**9  # that one scan alone may not be ahead of the one before
-_SET_BACK_AFTER = 2.0  # s in which all scans are older than the last one by more than the same
+_LEAP_NS = 5 * 10**9  # by which a stamp leaps that is farther ahead, or behind
+_LEAPS_FOR = 2.0  # s in which the stamps of all scans leap
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,10 @@ class _Waiting(NamedTuple):
 
 @dataclass
 class _Laser:
-    """State of one scan topic: newest stamp, its arrival, an unconfirmed leap of stamps."""
+    """State of one scan topic: newest stamp, its arrival, number of scans."""
 
     newest_ns: int
     arrived: float
-    leap_ns: int | None = None
     count: int = 0
 
 
@@ -96,7 +95,7 @@ class ScanIntake:
         self._last_ns, self._last_topics = 0, set[str]()  # of the last scan that was mapped
         self._first_arrived: float | None = None
         self._silent_ns = -1  # the last odometry when a scan waited for it in vain
-        self._behind_since: float | None = None
+        self._leaps_since: float | None = None
         self.set_back = 0.0
 
     def begin_anew(self) -> None:
@@ -109,8 +108,7 @@ class ScanIntake:
         stamp = stamp_ns(message.header)
         fault = self._find_damage(message) or (None if stamp > 0 else NO_STAMP)
         if fault is None:
-            self._check_set_back(stamp, now)
-            fault = self._check_leap(topic, stamp, now)
+            fault = self._check_clock(topic, stamp, now)
         if fault is not None:
             self.counts[fault] += 1
             return
@@ -158,26 +156,23 @@ class ScanIntake:
             self._mounts[key] = mount
         return self._mounts[key]
 
-    def _check_set_back(self, stamp: int, now: float) -> None:
-        """One scan with an old stamp means nothing, but a while in which there are no others."""
-        if stamp >= self._last_ns - _LEAP_NS:
-            self._behind_since, self.set_back = None, 0.0
-        elif self._behind_since is None:
-            self._behind_since = now
-        elif now - self._behind_since > _SET_BACK_AFTER:
-            self.counts[SET_BACK] += self.set_back == 0.0
-            self.set_back = 1e-9 * (self._last_ns - stamp)
-
-    def _check_leap(self, topic: str, stamp: int, now: float) -> str | None:
-        """A single stamp far ahead would make all later ones too late: another must confirm it."""
+    def _check_clock(self, topic: str, stamp: int, now: float) -> str | None:
+        """Why a stamp is not believed: one alone that leaps means nothing, but a while in which
+        there are no others does. Ahead they are used then, before the last scan never."""
         laser = self._lasers.setdefault(topic, _Laser(stamp, now))
         elapsed = round(1e9 * (now - laser.arrived))
-        is_leap = stamp - laser.newest_ns > _LEAP_NS + elapsed
-        is_confirmed = laser.leap_ns is not None and 0 < stamp - laser.leap_ns <= _LEAP_NS
-        if is_leap and not is_confirmed:
-            laser.leap_ns = stamp
+        is_ahead = stamp > laser.newest_ns + elapsed + _LEAP_NS
+        is_behind = stamp < self._last_ns - _LEAP_NS
+        if not (is_ahead or is_behind):
+            self._leaps_since, self.set_back = None, 0.0
+        elif self._leaps_since is None:
+            self._leaps_since = now
+        lasts = self._leaps_since is not None and now - self._leaps_since > _LEAPS_FOR
+        if is_behind and lasts:
+            self.counts[SET_BACK] += self.set_back == 0.0
+            self.set_back = 1e-9 * (self._last_ns - stamp)
+        if is_ahead and not lasts:
             return AHEAD
-        laser.leap_ns = None
         laser.newest_ns, laser.arrived = max(laser.newest_ns, stamp), now
         return None
 
