@@ -151,11 +151,6 @@ class GrowingArray:
         with suppress(OSError):
             os.ftruncate(self._file.fileno(), self._begin + length * self._row_bytes)
 
-    def row(self, at: int) -> Any:
-        """Row `at`, copied."""
-        data = os.pread(self._file.fileno(), self._row_bytes, self._begin + at * self._row_bytes)
-        return np.frombuffer(data, self.dtype).reshape(self._row)[()]
-
     def view(self) -> Array:
         """The array (N, *row) so far, memory-mapped and read-only; more may be appended."""
         shape = (self._length, *self._row)

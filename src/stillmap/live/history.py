@@ -274,4 +274,4 @@ class History(GrowingRecording):
         """The notes of a scan that is kept."""
         if number >= self.kept:
             raise InputError(f"scan {number}: is not kept, for the disk was full")
-        return self._arrays["notes"].row(number)
+        return self.notes()[number]
