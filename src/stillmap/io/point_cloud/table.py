@@ -21,7 +21,7 @@ from stillmap.core.input_files import InputFile
 from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
 from stillmap.io.text_lines import read_lines
 
-_BLOCK = 1 << 18  # points read at once
+_BLOCK, _BLOCK_BYTES = 1 << 18, 64 << 20  # points and bytes read at once
 _MAX_RECORD = 1 << 16  # bytes of one point
 _MAX_UNPACKED = 1 << 30  # bytes
 _MAX_EXPANSION = 100  # unpacked over packed bytes: LZF reaches a little less
@@ -133,8 +133,9 @@ def iter_records(layout: TableLayout) -> Iterator[NDArray[np.void]]:
         if file.size < layout.start + rows * size:
             raise truncated_error(layout.path)
         file.seek(layout.start)
-        for first in range(0, rows, _BLOCK):
-            yield np.frombuffer(file.read(min(_BLOCK, rows - first) * size), layout.dtype)
+        step = max(1, min(_BLOCK, _BLOCK_BYTES // size))
+        for first in range(0, rows, step):
+            yield np.frombuffer(file.read(min(step, rows - first) * size), layout.dtype)
 
 
 def _unpack(file: InputFile, layout: TableLayout) -> NDArray[np.void]:
