@@ -59,12 +59,12 @@ def write_line(line: str) -> None:
 
 
 @contextmanager
-def show_steps(quiet: bool) -> Iterator[Show]:
+def show_steps(quiet: bool, first: str = "") -> Iterator[Show]:
     """A function that shows a step, and how much of it is done; see `core.profiling.Show`."""
     if quiet or sys.stderr is None:  # None: closed before the start
         yield lambda *_: None
     else:
-        with profiling.show_steps(say) as show:
+        with profiling.show_steps(say, first) as show:
             yield show
 
 
@@ -78,7 +78,7 @@ def show_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
 @contextmanager
 def show_share(quiet: bool, what: str) -> Iterator[Callable[[float], None]]:
     """A function that shows the share of a job that is done, 0 to 1; nothing if quiet."""
-    with show_steps(quiet) as show:
+    with show_steps(quiet, what) as show:
         yield lambda share: show(what, float(share), 1.0)
 
 

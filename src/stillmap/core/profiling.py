@@ -90,13 +90,18 @@ def show_iterations(show: Show, iterations: int) -> Progress:
 
 
 @contextmanager
-def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
-    """Show steps on stderr: by a bar on a terminal, elsewhere by a line that `say` prints."""
+def show_steps(say: Callable[[str], None] = print_line, first: str = "") -> Iterator[Show]:
+    """Show steps on stderr: by a bar on a terminal, elsewhere by a line that `say` prints.
+
+    Args:
+        say: prints a line.
+        first: the step that begins at once, if it is known.
+    """
     if is_terminal(sys.stderr) or os.environ.get("FORCE_COLOR"):
         with _show_bar() as show:
             yield show
     else:
-        with _Lines(say).watch() as show:
+        with _Lines(say, first).watch() as show:
             yield show
 
 
@@ -133,9 +138,8 @@ class _Lines:
     A step that says nothing for `_SILENT_PERIOD` seconds is named again, by a thread of its own.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
-        self._step = self._ended = ""
+    def __init__(self, say: Callable[[str], None], first: str) -> None:
+        self._say, self._step, self._ended = say, first, ""
         self._started = self._printed = time.monotonic()
         self._is_over = threading.Event()
 
