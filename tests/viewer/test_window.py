@@ -11,7 +11,7 @@ from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS, legend_html
+from stillmap.results.viewer.window import ACTION_KEYS, LAYER_KEYS, legend_html
 
 
 def node(window, path):

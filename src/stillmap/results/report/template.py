@@ -29,6 +29,11 @@ def render_page(data: Mapping[str, Any], template: str = "report.html.j2") -> st
     return page.render({**known, **data, "version": package_version()})
 
 
+def load_parts(template: str) -> Any:
+    """The macros of a template, by name."""
+    return _environment().get_template(template).module
+
+
 @functools.cache
 def _environment() -> "Environment":
     """The templates with the filters below; HTML in data is escaped."""

@@ -1,6 +1,5 @@
 """Creation of viser nodes in the frame of a scene, and its default view."""
 
-import html
 import math
 import re
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
+from stillmap.results.report.template import load_parts
 from stillmap.results.viewer.scene import Scene
 from stillmap.results.viewer.server import Server
 
@@ -24,7 +24,6 @@ _MIN_EXTENT = 5.0  # m
 Float = NDArray[np.float64]
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 _LAYER_STEP = 0.02  # m between the map and what is drawn on it in 2D
-TEXT_STYLE = "font-size:.8em;line-height:1.5;padding:0 .9em"
 
 
 class DefaultView(NamedTuple):
@@ -162,9 +161,4 @@ def escape_markdown(text: str) -> str:
 
 def table_html(rows: Sequence[tuple[str, str]]) -> str:
     """A table of names and values."""
-    cells = "".join(
-        f'<tr><td style="padding-right:1em;opacity:.7">{html.escape(name)}</td>'
-        f"<td>{html.escape(value)}</td></tr>"
-        for name, value in rows
-    )
-    return f'<table style="{TEXT_STYLE}">{cells}</table>'
+    return str(load_parts("viewer.html.j2").table(rows))

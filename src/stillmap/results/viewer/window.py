@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.results.viewer.layers import Layers
-from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS, help_html, legend_html
+from stillmap.results import colors
+from stillmap.results.report.figures import UNKNOWN
+from stillmap.results.report.template import load_parts
+from stillmap.results.viewer.layers import DYNAMIC, STATIC, Layers
 from stillmap.results.viewer.measuring import Measuring
 from stillmap.results.viewer.nodes import (
     FIELD_OF_VIEW,
@@ -28,6 +30,38 @@ _FRAME_TIME = 0.1  # s between updates while playing
 _IDLE_TIME = 0.05  # s between polls of the controls
 _SPEEDS = {"1 x": 1.0, "3 x": 3.0, "10 x": 10.0, "30 x": 30.0, "100 x": 100.0}
 _LEGEND_MARGIN, _LEGEND_WIDTH = 15, 215  # pixels: to the borders of the page; of the panel
+
+
+# W, A, S, D, Q, E and the vertical arrows move viser's camera
+LAYER_KEYS = {
+    "Map": "1",
+    "Surface": "2",
+    STATIC: "3",
+    DYNAMIC: "4",
+    "Robot": "5",
+    "Beams": "6",
+    "Rays": "7",
+    "Objects": "8",
+    "Object tracks": "9",
+    "Object models": "0",
+    "Object ids": "N",
+    "Sessions": "T",
+    "Changes": "C",
+    "Change labels": "B",
+}
+ACTION_KEYS = {
+    "Play or pause": "space",
+    "Next scan": "arrowright",
+    "Previous scan": "arrowleft",
+    "First scan": "home",
+    "Last scan": "end",
+    "Measure": "M",
+    "Clear": "escape",
+    "Default view": "V",
+    "Legend": "L",
+    "Next session": "pagedown",
+    "Previous session": "pageup",
+}
 
 
 class Window:
@@ -231,11 +265,25 @@ class Window:
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         for note in scene.notes:
             gui.add_markdown(escape_markdown(note))
-        gui.add_html(help_html(self._actions()))
+        keys = {name: key for name, key in ACTION_KEYS.items() if name in self._actions()}
+        gui.add_html(load_parts("viewer.html.j2").keys(keys))
         self._panel: Any = gui.add_panel()
         self._panel.float(x=_LEGEND_MARGIN, y=-_LEGEND_MARGIN, width=_LEGEND_WIDTH)
         with self._panel.add_tab("Legend"):
             gui.add_html(legend_html(self._layers))
+
+
+def legend_html(layers: Layers) -> str:
+    """A row for each meaning of a color in the layers."""
+    text = load_parts("viewer.html.j2").legend(
+        layers=layers.default_visibility,
+        heights=layers.heights,
+        colors={**vars(colors), "UNKNOWN": UNKNOWN},
+        kinds=colors.KIND_COLORS,
+        ids=colors.color_by_id([0, 1, 2]).tolist(),
+        ramps=(colors.STATIC_COLORS, colors.HEIGHT_COLORS),
+    )
+    return str(text)
 
 
 def _toggle(control: Any, name: str = "value") -> None:
