@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder
+from stillmap.core.files import atomic_folder, write_text
 from stillmap.pipeline.options import MapMode
 from stillmap.results.export.zones import Action, SpeedLimit, Zone, cells_inside, is_within
 from stillmap.results.map_server import write_keepout_mask, write_map_server, write_speed_mask
 from stillmap.results.reader import Crossings, Grid
+from stillmap.results.report.template import render
 
 Mask = NDArray[np.bool_]
 
@@ -27,11 +27,6 @@ PARAMETERS = "nav2_params.yaml"
 # of nav2_msgs/CostmapFilterInfo
 _KEEPOUT, _SPEED_PERCENT, _SPEED_ABSOLUTE = 0, 1, 2
 _STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # m/s of a value of the mask
-
-_COMMENT = """\
-# Parameters of nav2 for the map and the masks in this folder: merge them into yours.
-# The names of files are relative: give full paths, or start the servers in this folder.
-"""
 
 
 class MaskCode(NamedTuple):
@@ -229,52 +224,7 @@ def write(maps: Maps, folder: Path, mode: MapMode, *, overwrite: bool = False) -
             write_keepout_mask(work, maps.keepout, maps.map)
         if maps.speed is not None:
             write_speed_mask(work, maps.speed, maps.map)
-        code = maps.code if maps.speed is not None else None
-        _write_parameters(work / PARAMETERS, maps.keepout is not None, code)
-
-
-def _write_parameters(path: Path, keepout: bool, speed: MaskCode | None) -> None:
-    """Write the parameters of the servers, and of the filters of both costmaps.
-
-    Args:
-        path: the file.
-        keepout: whether there is a keep-out mask.
-        speed: the code of the speed mask; None where there is none.
-    """
-    content: dict[str, Any] = {"map_server": _node(yaml_filename="map.yaml")}
-    filters: dict[str, dict[str, Any]] = {}
-    nodes: list[str] = []
-    masks = {"keepout": MaskCode(_KEEPOUT, 0.0, 1.0)} if keepout else {}
-    if speed is not None:
-        masks["speed"] = speed
-    for name, (kind, base, multiplier) in masks.items():
-        # absolute: the servers and the costmaps live in different namespaces
-        info, mask = f"/{name}_costmap_filter_info", f"/{name}_filter_mask"
-        server = f"{name}_filter_mask_server"
-        content[server] = _node(yaml_filename=f"{name}.yaml", topic_name=mask, frame_id="map")
-        content[info[1:] + "_server"] = _node(
-            type=kind, filter_info_topic=info, mask_topic=mask, base=base, multiplier=multiplier
-        )
-        nodes += [server, info[1:] + "_server"]
-        plugin = f"nav2_costmap_2d::{name.capitalize()}Filter"
-        filters[f"{name}_filter"] = {"plugin": plugin, "enabled": True, "filter_info_topic": info}
-    if "speed_filter" in filters:
-        filters["speed_filter"]["speed_limit_topic"] = "/speed_limit"
-    if nodes:
-        content["lifecycle_manager_costmap_filters"] = _node(autostart=True, node_names=nodes)
-        content["global_costmap"] = {"global_costmap": _costmap(filters)}
-        # one costmap publishes the limits
-        local = {name: one for name, one in filters.items() if name != "speed_filter"}
-        if local:
-            content["local_costmap"] = {"local_costmap": _costmap(local)}
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=False)
-    path.write_text(_COMMENT + text, encoding="utf-8")
-
-
-def _node(**parameters: Any) -> dict[str, Any]:
-    return {"ros__parameters": parameters}
-
-
-def _costmap(filters: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    # copies: ROS does not read the aliases that YAML has for what occurs twice
-    return _node(filters=list(filters), **{name: dict(one) for name, one in filters.items()})
+        masks = {} if maps.keepout is None else {"keepout": MaskCode(_KEEPOUT, 0.0, 1.0)}
+        if maps.speed is not None:
+            masks["speed"] = maps.code
+        write_text(work / PARAMETERS, render("nav2_params.yaml.j2", masks=masks))

@@ -25,8 +25,12 @@ def render_page(data: Mapping[str, Any], template: str = "report.html.j2") -> st
     # without its hash, browsers run no script of the page
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     known = {"result": None, "place": None, "script": script, "script_hash": digest}
-    page = _environment().get_template(template)
-    return page.render({**known, **data, "version": package_version()})
+    return render(template, **{**known, **data, "version": package_version()})
+
+
+def render(template: str, **data: Any) -> str:
+    """The text of a template."""
+    return _environment().get_template(template).render(data)
 
 
 def load_parts(template: str) -> Any:
