@@ -15,7 +15,7 @@ from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.live.known_map import LOG_RATIO, KeptMap, KnownMap
 from stillmap.live.sweep_view import STANDS, count_up, is_level
-from stillmap.places.evidence import cell_keys
+from stillmap.places.evidence import cell_keys, look_up
 from stillmap.results.near_result import NearResult
 from stillmap.slam import lidar_odometry
 
@@ -176,7 +176,8 @@ def thin_route(poses: Float) -> Float:
 def _find_standing(points: Float32, now: CellProbabilities, p_unseen: float, edge: float) -> Bool:
     """(N,) which points (N, 3) lie in voxels that are still occupied."""
     cells, of = unique_cells(np.floor(points / edge).astype(np.int64))
-    shared = _share_evidence(cells, _look_up(now, cells), p_unseen).astype(np.float32)
+    p_occupied = look_up(now.cells, now.p_occupied, cells, 1.0)  # 1: nothing is known of it
+    shared = _share_evidence(cells, p_occupied, p_unseen).astype(np.float32)
     return np.asarray(shared[of] >= STANDS)
 
 
@@ -200,16 +201,6 @@ def _sum_around(cells: Int64, values: Float) -> Float:
         first, last = (cell_keys(cells + np.array([x - 1, y - 1, z])) for z in (-1, 1))
         out += sums[np.searchsorted(keys, last, "right")] - sums[np.searchsorted(keys, first)]
     return out
-
-
-def _look_up(now: CellProbabilities, cells: Int64) -> Float:
-    """(N,) probabilities of cells (N, 3); 1: nothing is known of it."""
-    keys = cell_keys(now.cells)
-    order = np.argsort(keys)
-    sought = cell_keys(cells)
-    at = np.minimum(np.searchsorted(keys, sought, sorter=order), len(keys) - 1)
-    known = order[at]
-    return np.where(keys[known] == sought, now.p_occupied[known], 1.0)
 
 
 def _read_points(near: NearResult) -> tuple[Float32, Float32]:

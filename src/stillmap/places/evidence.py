@@ -8,6 +8,7 @@ the place puts the session.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,18 @@ def cell_keys(cells: NDArray[np.integer]) -> Int64:
     for column in cells.T:
         key = (key << bits) + (column.astype(np.int64) + (1 << (bits - 1)))
     return key
+
+
+def look_up(
+    cells: NDArray[np.integer], values: NDArray[Any], sought: Int64, default: float
+) -> NDArray[Any]:
+    """(n,) the values (K,) of cells (K, D) that are sought (n, D); a default for all others."""
+    if not len(cells):
+        return np.full(len(sought), default)
+    keys, wanted = cell_keys(cells), cell_keys(sought)
+    order = np.argsort(keys)
+    at = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
+    return np.where(keys[at] == wanted, values[at], default)
 
 
 Bytes = NDArray[np.uint8]

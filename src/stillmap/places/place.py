@@ -128,8 +128,7 @@ class PlacedSession(ShortRepr):
         nodes: (N, D+1, D+1) T_place_base of the nodes of its pose graph.
         covariance: (3, 3), in 3D (6, 6), of its alignment at its first scan; 0 of the first.
         overlap: share of its hits in area that the sessions before it knew; 1 of the first.
-        evidence: in D dimensions; None: not measured yet.
-        planar_evidence: in the plane; in 2D the same.
+        evidence: in D dimensions and in the plane, in 2D the same; None: not measured yet.
         measured_at: (K, D+1, D+1) poses of the keyframes at which evidence was measured.
     """
 
@@ -137,8 +136,7 @@ class PlacedSession(ShortRepr):
     nodes: Float
     covariance: Float
     overlap: float = 1.0
-    evidence: Evidence | None = None
-    planar_evidence: Evidence | None = None
+    evidence: tuple[Evidence, Evidence] | None = None
     measured_at: Float | None = None
 
     @property
@@ -168,9 +166,9 @@ class PlacedSession(ShortRepr):
         Raises:
             RuntimeError: it has not been measured.
         """
-        if self.evidence is None or self.planar_evidence is None:
+        if self.evidence is None:
             raise RuntimeError("evidence has not been measured")
-        return self.evidence, self.planar_evidence
+        return self.evidence
 
 
 def to_planar(session: Session, keyframe_poses: Float) -> Float:
@@ -241,7 +239,7 @@ def _measure(placed: PlacedSession, place: Place, limit: float, threads: int) ->
     evidence = planar
     if session.dimension == 3:
         evidence = measure_evidence(session.keyframes, poses, place.voxel_size, threads)
-    return replace(placed, evidence=evidence, planar_evidence=planar, measured_at=poses)
+    return replace(placed, evidence=(evidence, planar), measured_at=poses)
 
 
 def estimate_covariance(placed: PlacedSession, ties: Sequence[Tie]) -> Float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import neighbor_pairs
-from stillmap.places.evidence import BLOCK, Bytes, Evidence, cell_keys, crop_without_gaps, to_sums
+from stillmap.places.evidence import BLOCK, Bytes, Evidence, crop_without_gaps, look_up, to_sums
 
 # nats: of a static hit within the tolerance, of a pass through all cells around; of one session at
 # most, since its beams share the session's errors
@@ -252,17 +252,7 @@ class PlaceStates(ShortRepr):
 
     def look_up(self, points: Float, values: Float) -> Float:
         """(n,) values (K,) of the cells that hold points (n, D); 0 where nothing ever stood."""
-        key, order = self._index()
-        wanted = cell_keys(np.floor(points / self.resolution).astype(np.int64))
-        at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
-        if not len(key):
-            return np.zeros(len(points))
-        return np.where(key[at] == wanted, values[order[at]], 0.0)
-
-    def _index(self) -> tuple[Int64, Index]:
-        key = cell_keys(self.cells)
-        order = np.argsort(key)
-        return key[order], order
+        return look_up(self.cells, values, np.floor(points / self.resolution).astype(np.int64), 0.0)
 
     def with_evidence(self, evidence: Float32, changed: Index) -> "PlaceStates":
         """The same with other evidence (K, S) of the cells `changed` (n,)."""
