@@ -202,14 +202,13 @@ def _map_tilting_laser(
     result: MappingResult, tilting: Recording, options: Options
 ) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
-    from stillmap.core.local_frame import Shift, shift
-    from stillmap.pipeline.map_frame import FIELDS
+    from stillmap.pipeline.map_frame import leave_local_frame
     from stillmap.pipeline.tilting import PlanarResult, build_tilting
 
     near, threads = result.near, resolve_threads(options.threads)
     planar = PlanarResult(near.deskewed, near.poses, near.p_static, near.objects)
     built = build_tilting(planar, tilting, options.em, threads)
-    return dataclasses.replace(shift(built, Shift(result.origin), FIELDS), local=built)
+    return leave_local_frame(built, result.origin)
 
 
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")

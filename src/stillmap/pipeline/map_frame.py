@@ -4,13 +4,15 @@ Given poses set the map frame, and so may the coordinates of clouds: it may begi
 """
 
 import dataclasses
+from types import MappingProxyType
+from typing import TypeVar
 
 import numpy as np
 
 from stillmap import em, slam
 from stillmap.core.array_types import Float
 from stillmap.core.grid_map import GridMap
-from stillmap.core.local_frame import Fields, Shift, find_origin, shift_poses
+from stillmap.core.local_frame import Fields, Shift, find_origin, shift, shift_poses
 from stillmap.core.recording import Recording
 from stillmap.em.types import CellProbabilities, ChangedCells, NoReturnModel
 from stillmap.io.point_cloud.clouds import cloud_origin
@@ -21,6 +23,8 @@ from stillmap.pipeline.snapshots import Snapshot
 from stillmap.pipeline.tilting import TiltingResult
 from stillmap.tracking import FlowMap, MovingObject
 from stillmap.tracking.boxes import Box
+
+Result = TypeVar("Result")
 
 
 def enter_local_frame(
@@ -54,16 +58,6 @@ def move_odometry(recording: Recording, metres: Float) -> Recording:
     return dataclasses.replace(recording, T_odom_base=shift_poses(recording.T_odom_base, metres))
 
 
-def to_map_frame(origin: Float, local_map: em.OccupancyMap) -> Shift:
-    """From a local frame with this origin (3,) to the map frame; `local_map`: the map in it."""
-    by = Shift.of(origin, local_map.resolution)
-    x, y, yaw = local_map.origin
-    corner = x + float(origin[0]), y + float(origin[1]), yaw
-    moved = dataclasses.replace(local_map, origin=corner)
-    by.cells[:2] = moved.window.first_cell - local_map.window.first_cell
-    return by
-
-
 # fields that depend on the frame
 FIELDS: Fields = {
     Estimate: {"m_step": "part", "e_step": "part"},
@@ -87,3 +81,26 @@ FIELDS: Fields = {
     TiltingResult: {"poses": "poses", "objects": "part", "boxes": "part"},
     Box: {"xy": "points"},
 }
+
+
+def leave_local_frame(
+    result: Result,
+    origin: Float,
+    local_map: em.OccupancyMap | None = None,
+    fields: Fields = MappingProxyType({}),
+) -> Result:
+    """A result that was computed in a local frame, in the map frame, with itself as `local`.
+
+    Args:
+        result: a dataclass; itself where both frames are the same.
+        origin: (3,) of the local frame.
+        local_map: the map in it, by whose corner cells are rounded; None: there are no cells.
+        fields: of the result, beside `FIELDS`.
+    """
+    by = Shift(origin)
+    if local_map is not None:
+        by = Shift.of(origin, local_map.resolution)
+        moved_map = shift(local_map, by, FIELDS)
+        by.cells[:2] = moved_map.window.first_cell - local_map.window.first_cell
+    moved = shift(result, by, {**FIELDS, **fields})
+    return result if moved is result else dataclasses.replace(moved, local=result)  # type: ignore[type-var]

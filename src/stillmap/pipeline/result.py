@@ -11,7 +11,6 @@ import numpy as np
 
 from stillmap import em, slam
 from stillmap.core.array_types import Float, Float32
-from stillmap.core.local_frame import shift
 from stillmap.core.parallel import limit_blas_threads, resolve_threads, trim_heap, work_beside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
@@ -21,7 +20,7 @@ from stillmap.pipeline.calibration import correct_recording
 from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import EmState, Estimate, IterationRecord, iterate
 from stillmap.pipeline.final_map import FinalEstimate, Maps, final_estimate, find_objects, make_maps
-from stillmap.pipeline.map_frame import FIELDS, enter_local_frame, move_odometry, to_map_frame
+from stillmap.pipeline.map_frame import enter_local_frame, leave_local_frame, move_odometry
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
@@ -192,7 +191,10 @@ def map_recording(
     result = dataclasses.replace(
         result, recording=recording, calibration=calibration, warnings=warnings
     )
-    return _leave_local_frame(result, origin)
+    parts = ("snapshots", "estimate", "maps", "objects", "traffic", "changes", "doors")
+    fields: dict[type, dict[str, str]] = {MappingResult: dict.fromkeys(parts, "part")}
+    moved = leave_local_frame(result, origin, result.map, fields)
+    return dataclasses.replace(moved, origin=origin)
 
 
 def _run_em(
@@ -276,13 +278,3 @@ def _track_and_rate(
         progress("rating the map", 0, 0, 0)
         with stages.measure("quality"):
             return objects, rated()
-
-
-def _leave_local_frame(result: MappingResult, origin: Float) -> MappingResult:
-    """A result that was computed in a frame near the robot, in the map frame."""
-    if not origin.any():
-        return result
-    parts = ("snapshots", "estimate", "maps", "objects", "traffic", "changes", "doors")
-    fields = {**FIELDS, MappingResult: dict.fromkeys(parts, "part")}
-    moved = shift(result, to_map_frame(origin, result.map), fields)
-    return dataclasses.replace(moved, origin=origin, local=result)
