@@ -11,6 +11,7 @@ from stillmap.live.graph_sparsification import AnchoredPoses
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.scan import to_beams
+from stillmap.sim.laser import Movers, cast_beams
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopClosure, LoopContext
@@ -123,23 +124,10 @@ def test_scans_that_left_the_graph_move_with_one_that_stayed():
     np.testing.assert_allclose(anchored.place(T @ in_graph[LAP:]), T @ poses, atol=1e-9)
 
 
-class _Room:
-    """Scans from within a room with a step in each wall."""
-
-    CORNERS = np.array(
-        "-3,-3 14,-3 14,5 12.5,5 12.5,13 4,13 4,14 -3,14 -3,6 -2,6".replace(",", " ").split(), float
-    ).reshape(-1, 2)
-    WALLS = np.concatenate([CORNERS, np.roll(CORNERS, -1, axis=0)], axis=1)
-
-    def look(self, T):
-        x, y, theta = se2.parameters(T)
-        directions = np.stack([np.cos(ANGLES + theta), np.sin(ANGLES + theta)], axis=1)
-        a, b = self.WALLS[:, :2] - (x, y), self.WALLS[:, 2:] - self.WALLS[:, :2]
-        cross = directions[:, 0, None] * b[:, 1] - directions[:, 1, None] * b[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / cross
-            u = (a[:, 0] * directions[:, 1, None] - a[:, 1] * directions[:, 0, None]) / cross
-        return np.where((t > 0) & (u >= -1e-9) & (u <= 1 + 1e-9), t, np.inf).min(axis=1)
+# a room with a step in each wall
+CORNERS = [(-3, -3), (14, -3), (14, 5), (12.5, 5), (12.5, 13), (4, 13), (4, 14), (-3, 14), (-3, 6)]
+CORNERS = np.array([*CORNERS, (-2, 6)], float)
+WALLS = np.concatenate([CORNERS, np.roll(CORNERS, -1, axis=0)], axis=1)
 
 
 @pytest.mark.slow
@@ -147,12 +135,15 @@ def test_poses_stay_right_while_scans_leave_the_graph(monkeypatch):
     """Many laps of a drifting robot."""
     monkeypatch.setattr(loop_closer, "_MIN_SCANS", 4 * LAP)
     monkeypatch.setattr(graph_sparsification, "_LATEST", 1)
-    closer, room, truth = LoopCloser(SlamOptions()), _Room(), drive(8)
+    closer, truth = LoopCloser(SlamOptions()), drive(8)
+    n = len(truth)
+    nobody = Movers(np.zeros((n, 0, 2)), np.zeros((n, 0)), np.zeros((0, 2)), np.zeros(0, np.int32))
+    ranges = cast_beams(se2.parameters(truth), ANGLES, WALLS, nobody).range
     rng, T = np.random.default_rng(2), np.eye(3)
     for k, at in enumerate(truth):
         step = se2.matrix(*rng.normal(0.0, [0.006, 0.006, 0.003]))
         T = T if k == 0 else T @ se2.inverse(truth[k - 1]) @ at @ step
-        beams = to_beams(stillmap.Scan(k * 10**9, room.look(at), ANGLES))
+        beams = to_beams(stillmap.Scan(k * 10**9, ranges[k], ANGLES))
         scan = MappedScan(beams, np.ones(len(ANGLES), np.float32), T, 0.5 * k)
         closer.add(scan, 1.0, np.zeros((3, 3)))
         closer.poll()

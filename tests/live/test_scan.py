@@ -33,6 +33,9 @@ def test_points_with_and_without_returns():
     np.testing.assert_allclose(beams.points[2], [3.0, 4.0])
     assert np.isnan(beams.points[1]).all()
     assert not np.isnan(points[0]).any()  # not written into
+    beams = to_beams(Scan(0, points=points, max_range=2.5))
+    assert beams.hit.tolist() == [True, False, False]
+    np.testing.assert_allclose(beams.points[2], [1.5, 2.0])
 
 
 @pytest.mark.parametrize(
