@@ -1,4 +1,4 @@
-"""A part of a recording by time: the same scans whatever the format, with nothing else decoded."""
+"""A part of a recording by time: the same scans whatever the format."""
 
 from pathlib import Path
 
@@ -8,7 +8,6 @@ from cut_recordings import PERIOD, START, N, make_recording
 
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
-from stillmap.io.ros import lasers
 from stillmap.prepare.options import ReadOptions
 
 FORMS_2D = {"carmen": ".clf", "bag": ".bag", "db3": ".db3", "mcap": ".mcap", "stillmap": ""}
@@ -57,16 +56,6 @@ def test_an_empty_part_names_the_span(dimension, form, tmp_path):
             read(path, ReadOptions(start=start, end=end))
         assert caught.value.where == str(path)
         assert f"stamps {START}.000000000 to {START + 5}.900000000" in str(caught.value)
-
-
-@pytest.mark.parametrize("form", ["bag", "mcap"])
-def test_scans_outside_are_not_decoded(form, tmp_path, monkeypatch):
-    path = written(2, form, tmp_path)
-    decoded = []
-    decode = lasers.decode
-    monkeypatch.setattr(lasers, "decode", lambda one: decoded.append(one) or decode(one))
-    assert read(path, ReadOptions(start=1.0, end=1.2)).n_scans == 3
-    assert len(decoded) == 3
 
 
 def test_clouds_outside_are_not_opened(tmp_path):
