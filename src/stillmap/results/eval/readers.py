@@ -15,7 +15,6 @@ from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
 from stillmap.io.carmen.log import CarmenLog, read_log
-from stillmap.io.reader import read as recording_of
 from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
@@ -84,20 +83,16 @@ def read_truth(path: Path, labels: Labels | None = None) -> Truth:
     """
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
     if (folder / "truth").is_dir():
-        return _truth(folder)
+        return Truth(folder, read_folder(folder))
     inside = [path / name for name in RIG_FOLDERS]
     if not all((one / "truth").is_dir() for one in inside):
         hint = "a folder that 'stillmap simulate' wrote"
         raise InputError("holds no truth", where=str(path), hint=hint)
     if labels is None:
-        return _truth(inside[0])
+        return Truth(inside[0], read_folder(inside[0]))
     # both lasers may have equal stamps and numbers of beams; their hits differ
-    return max(map(_truth, inside), key=lambda truth: _matching_share(labels, truth.recording))
-
-
-def _truth(folder: Path) -> Truth:
-    log = folder / "recording.log"  # a simulation in CARMEN's format
-    return Truth(folder, recording_of(log) if log.exists() else read_folder(folder))
+    both = [Truth(one, read_folder(one)) for one in inside]
+    return max(both, key=lambda truth: _matching_share(labels, truth.recording))
 
 
 def _matching_share(labels: Labels, recording: Recording) -> float:
