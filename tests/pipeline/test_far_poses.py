@@ -150,7 +150,7 @@ def test_a_trajectory_that_was_written_is_read_again(room, tmp_path):
 def test_absurd_poses_are_refused(room, tmp_path):
     recording = room.recording
     poses = shift(room.truth.T_world_base, 1e10 * np.ones(3))
-    with pytest.raises(ValueError, match=r"(?s)poses: expected numbers below 1e\+09, got .* at 0"):
+    with pytest.raises(ValueError, match=r"(?s)poses: .* within a million km, got .* at 0"):
         stillmap.build(recording, poses=poses)
     write_tum(tmp_path / "poses.tum", recording.stamp_ns, poses)
     with pytest.raises(stillmap.InputError, match=r"poses\.tum:1: is no pose"):

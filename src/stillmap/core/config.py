@@ -130,6 +130,13 @@ def _declare(field: dataclasses.Field[Any], hint: Any) -> Declaration:
     return Declaration(kind, is_optional, limits, field.default, field.metadata.get("doc", ""))
 
 
+def _plain(value: Any) -> Any:
+    """Numbers as floats, alone or in a list: NumPy's are of a subclass."""
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return float(value) if isinstance(value, float) else value
+
+
 def _check(value: Any, declared: Declaration, name: str) -> Any:
     """The value of an option as its type: integers as floats, lists as tuples.
 
@@ -140,8 +147,7 @@ def _check(value: Any, declared: Declaration, name: str) -> Any:
         return None
     needed = " or ".join(map(repr, declared.choices)) or _NOUNS.get(declared.kind, "a list")
     with suppress(msgspec.ValidationError):
-        plain = float(value) if isinstance(value, float) else value  # NumPy's are of a subclass
-        checked = msgspec.convert(plain, declared.kind)
+        checked = msgspec.convert(_plain(value), declared.kind)
         if not isinstance(checked, float) or math.isfinite(checked):
             needed = describe_range(declared.limits) or needed
             return msgspec.convert(checked, Annotated[declared.kind, Meta(**declared.limits)])

@@ -262,7 +262,7 @@ def poses_to_matrices(
     array = array.astype(np.float64)
     with np.errstate(invalid="ignore"):
         T = se2.matrix(*array.T) if flat else array
-    require_all(name, is_rigid(T, _MAX_SKEW), "rigid transforms", array)
+    require_all(name, is_rigid(T, _MAX_SKEW), "rigid transforms within a million km", array)
     return T
 
 
