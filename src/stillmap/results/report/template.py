@@ -33,9 +33,9 @@ def render(template: str, **data: Any) -> str:
     return _environment().get_template(template).render(data)
 
 
-def load_parts(template: str) -> Any:
-    """The macros of a template, by name."""
-    return _environment().get_template(template).module
+def render_part(template: str, macro: str, *arguments: Any) -> str:
+    """The text of a macro of a template; a plain one, as viser sends no other kinds."""
+    return str(getattr(_environment().get_template(template).module, macro)(*arguments))
 
 
 @functools.cache

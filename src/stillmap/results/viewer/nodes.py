@@ -10,7 +10,7 @@ import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
-from stillmap.results.report.template import load_parts
+from stillmap.results.report.template import render_part
 from stillmap.results.viewer.scene import Scene
 from stillmap.results.viewer.server import Server
 
@@ -161,4 +161,4 @@ def escape_markdown(text: str) -> str:
 
 def table_html(rows: Sequence[tuple[str, str]]) -> str:
     """A table of names and values."""
-    return str(load_parts("viewer.html.j2").table(rows))
+    return render_part("viewer.html.j2", "table", rows)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap.results import colors
 from stillmap.results.report.figures import UNKNOWN
-from stillmap.results.report.template import load_parts
+from stillmap.results.report.template import render_part
 from stillmap.results.viewer.layers import DYNAMIC, STATIC, Layers
 from stillmap.results.viewer.measuring import Measuring
 from stillmap.results.viewer.nodes import (
@@ -266,7 +266,7 @@ class Window:
         for note in scene.notes:
             gui.add_markdown(escape_markdown(note))
         keys = {name: key for name, key in ACTION_KEYS.items() if name in self._actions()}
-        gui.add_html(load_parts("viewer.html.j2").keys(keys))
+        gui.add_html(render_part("viewer.html.j2", "keys", keys))
         self._panel: Any = gui.add_panel()
         self._panel.float(x=_LEGEND_MARGIN, y=-_LEGEND_MARGIN, width=_LEGEND_WIDTH)
         with self._panel.add_tab("Legend"):
@@ -275,15 +275,11 @@ class Window:
 
 def legend_html(layers: Layers) -> str:
     """A row for each meaning of a color in the layers."""
-    text = load_parts("viewer.html.j2").legend(
-        layers=layers.default_visibility,
-        heights=layers.heights,
-        colors={**vars(colors), "UNKNOWN": UNKNOWN},
-        kinds=colors.KIND_COLORS,
-        ids=colors.color_by_id([0, 1, 2]).tolist(),
-        ramps=(colors.STATIC_COLORS, colors.HEIGHT_COLORS),
-    )
-    return str(text)
+    shades = (colors.STATIC_COLORS, colors.HEIGHT_COLORS)
+    shown = {**vars(colors), "UNKNOWN": UNKNOWN}
+    ids = colors.color_by_id([0, 1, 2]).tolist()
+    drawn = (layers.default_visibility, layers.heights, shown, colors.KIND_COLORS, ids, shades)
+    return render_part("viewer.html.j2", "legend", *drawn)
 
 
 def _toggle(control: Any, name: str = "value") -> None:
