@@ -37,10 +37,11 @@ import stillmap
 from stillmap.core import se2
 from stillmap.io.trajectory import read_tum
 from stillmap.places.grow import add_session, lift_alignment, start_place
-from stillmap.places.inputs import to_session
+from stillmap.places.inputs import SessionInput, keep_session
 from stillmap.places.keyframes import Session
 from stillmap.places.place import Place, fit_alignment
 from stillmap.places.placement import find_placement
+from stillmap.places.store import read_session
 from stillmap.results.eval.trajectory import align
 
 Float = NDArray[np.float64]
@@ -117,8 +118,12 @@ def load_session(data: Path, path: Path) -> Mapped:
     if not (result / "run.json").exists():
         program = [*merging.STILLMAP, "map", str(path), "-o", str(result)]
         subprocess.run([*program, "--quiet", "--threads", "1"], check=True)
-    loaded = stillmap.load(result)
-    session = to_session(name, loaded, loaded.deskewed, 1)
+    if (data / "sessions" / name).exists():
+        session = read_session(data / "sessions" / name, str(path))
+    else:
+        loaded = stillmap.load(result)
+        source = SessionInput(name, loaded)
+        session = keep_session(source, loaded, loaded.deskewed, data, stillmap.Options())
     if not cloud.exists():
         cloud.parent.mkdir(parents=True, exist_ok=True)
         np.save(cloud, static_points(session))

@@ -159,10 +159,11 @@ def test_names_of_the_contract() -> None:
 
 SECTIONS = {"": Options(), **vars(Options()), "slam.odometry": Options().slam.odometry}
 RANGES = [
-    (f"{section}.{name}".lstrip("."), key, one.limits[key])
+    (f"{section}.{name}".lstrip("."), key, limit)
     for section, options in SECTIONS.items()
     for name, one in declared_options(type(options)).items()
-    for key in one.limits.keys() & {"ge", "gt", "le", "lt"}
+    for key, limit in one.limits.items()
+    if key in {"ge", "gt", "le", "lt"}
 ]
 
 

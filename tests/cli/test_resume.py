@@ -19,7 +19,7 @@ from result_contents import contents
 
 from stillmap.cli.main import main
 from stillmap.core import array_folder
-from stillmap.pipeline import result
+from stillmap.pipeline import checkpoint, result
 from stillmap.pipeline.em_loop import iterate
 from stillmap.results import writer
 
@@ -191,6 +191,20 @@ def test_damaged_checkpoint_is_named(call, room, tmp_path, interrupted, name):
     assert done.returncode == 2
     assert f"iteration-2/{name}" in done.stderr
     assert call("map", room, "-o", tmp_path / "out", *WORDS).returncode == 0
+
+
+def test_objects_in_a_checkpoint_are_refused(call, room, tmp_path, interrupted):
+    """Their bytes would be taken for addresses in memory."""
+    folder = interrupted / "iteration-2"
+    record = json.loads((folder / "checkpoint.json").read_text())
+    packed, *arrays = (np.load(folder / f"{number}.npy") for number in range(record["arrays"]))
+    assert b"<f8" in packed.tobytes()
+    packed = np.frombuffer(packed.tobytes().replace(b"<f8", b"|O8"), np.uint8)
+    np.save(folder / "0.npy", packed)
+    record["digest"] = checkpoint._digest(packed, *arrays)
+    (folder / "checkpoint.json").write_text(json.dumps(record))
+    done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+    refused(done, "checkpoint.json: is damaged", "OBJECT array")
 
 
 def test_concurrent_runs_into_one_folder(call, room, tmp_path, interrupted):

@@ -172,7 +172,8 @@ def _unpack(large: list[NDArray[Any]], code: int, packed: memoryview) -> Any:
     if code == _GRID:
         return em.make_grid(*content)
     dtype, shape, values = content
-    return np.ndarray(shape, np.dtype(dtype), bytearray(values))
+    # refuses objects, which would be addresses in memory
+    return np.frombuffer(bytearray(values), dtype).reshape(shape)
 
 
 def identify_run(recording: Recording, options: Options, poses: Float | None) -> dict[str, Any]:

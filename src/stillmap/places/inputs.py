@@ -162,7 +162,7 @@ def _prepare_session(
     if isinstance(given, tuple) and _is_one_result(given):
         given = load(given[0])
     if isinstance(given, Result) and given.path is not None:
-        return _keep_session(session, given, given.deskewed, folder, options)
+        return keep_session(session, given, given.deskewed, folder, options)
     with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
         if not isinstance(given, Result):
             source = given[0] if isinstance(given, tuple) and len(given) == 1 else given
@@ -172,10 +172,10 @@ def _prepare_session(
         del given
         result = load(mapped)
         deskewed = deskew_recording(recording, result.poses, result.options.slam)
-        return _keep_session(session, result, deskewed, folder, options)
+        return keep_session(session, result, deskewed, folder, options)
 
 
-def _keep_session(
+def keep_session(
     source: SessionInput, result: Result, deskewed: Recording, folder: Path, options: Options
 ) -> Session:
     """Write what the place keeps of a mapped session, and open it again from there.
