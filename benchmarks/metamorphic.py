@@ -111,7 +111,7 @@ def write_log(log: Log, path: Path) -> None:
 
 
 def _scan_text(scan: ScanLine, log: Log, poses: str, stamp: str) -> str:
-    start, step, longest = scan.config
+    start, step, _, longest = scan.config
     angles = start + step * np.arange(len(scan.ranges))
     kept = np.abs(angles) < log.fov / 2 + 1e-3
     # where the laser sees nothing it says its reach

@@ -191,7 +191,7 @@ def test_poses_and_images(path, tmp_path, capsys):
 
 
 def test_what_is_left_out_of_parts_that_overlap(tmp_path, capsys):
-    scans = [f"FLASER 2 1 2 {x} 0 0 {x} 0 0 {100 + x} host 0.1\n" for x in range(9)]
+    scans = [f"FLASER 2 1 2 {x} 0 0 {x} 0 0 {100 + 2 * x} host 0.1\n" for x in range(9)]
     names = [tmp_path / "a.log", tmp_path / "b.log", tmp_path / "elsewhere.log"]
     for path, part in zip(names, (scans[:5], scans[3:], scans), strict=True):
         path.write_text("".join(part))

@@ -1,4 +1,4 @@
-"""Exact stamps, and the longest subsequence of non-decreasing ones."""
+"""Exact stamps, and records in order of time."""
 
 from itertools import combinations
 
@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stillmap.core.timestamps import MAX_STAMP_NS, longest_non_decreasing, parse_ns
+from stillmap.core.timestamps import (
+    MAX_STAMP_NS,
+    longest_non_decreasing,
+    order_in_time,
+    parse_ns,
+)
 
 
 @pytest.mark.parametrize(
@@ -42,6 +47,23 @@ def test_refused(text):
 def test_every_nanosecond_is_kept(ns):
     sign = "-" if ns < 0 else ""
     assert parse_ns(f"{sign}{abs(ns) // 10**9}.{abs(ns) % 10**9:09d}") == ns
+
+
+@pytest.mark.parametrize(
+    ("tenths", "order"),
+    [
+        ([], []),
+        ([0, 4, 5, 2, 6], [0, 3, 1, 2, 4]),  # late
+        ([0, 9000, 4, 5], [0, 2, 3]),  # a stamp that jumps
+        ([30, 0, 1, 2, 3], [1, 2, 3, 4]),
+        ([5, 0, 1, 2, 3], [1, 2, 3, 4, 0]),
+        ([0, 20, 40, 60, 80, 10, 30, 50], [0, 1, 2, 3, 4]),  # the clock is set back for good
+        ([0, 40, 80, 120, 20, 60, 100, 140, 180], [0, 4, 5, 6, 7, 8]),
+        ([0, 0, 5, 0], [0, 1, 3, 2]),
+    ],
+)
+def test_order_in_time(tenths, order):
+    assert order_in_time(np.array(tenths, np.int64) * 10**8).tolist() == order
 
 
 @given(st.lists(st.integers(-3, 6), max_size=9))

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 # ns from 1970, the years 1824 to 2116: the time between any two stamps fits into int64
 MAX_STAMP_NS = 2**62 - 1
 
+MAX_LATENESS_NS = 10**9  # of a scan among others: a larger one is no delay, but another clock
+
 MAX_BEAM_TIME = 60.0  # s from the stamp of a scan: times farther from it are damaged
 
 
@@ -42,6 +44,25 @@ def format_seconds(stamp_ns: int) -> str:
     """Seconds with nine decimals, exact."""
     whole, rest = divmod(abs(stamp_ns), 10**9)
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def order_in_time(stamp_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Indices that sort stamps (T,), as recorded one after the other, without those that are off.
+
+    Records that come late are sorted. Left out are those that are off by more than
+    `MAX_LATENESS_NS`, as where a stamp jumps or the clock was set back, and late ones about these.
+    """
+    forward = longest_non_decreasing(stamp_ns.tolist())
+    others = np.delete(np.arange(len(stamp_ns)), forward)
+    run = np.searchsorted(forward, others)
+    before = stamp_ns[forward[np.maximum(run - 1, 0)]]
+    after = stamp_ns[forward[np.minimum(run, len(forward) - 1)]]
+    off = np.maximum(before - stamp_ns[others], stamp_ns[others] - after)
+    jumps = before[off > MAX_LATENESS_NS]
+    near = np.searchsorted(jumps, stamp_ns[others] + np.array([[-1], [1]]) * MAX_LATENESS_NS)
+    is_late = (off <= MAX_LATENESS_NS) & (near[0] == near[1])
+    kept = np.sort(np.concatenate([forward, others[is_late]]))
+    return np.asarray(kept[np.argsort(stamp_ns[kept], kind="stable")])
 
 
 def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:

@@ -16,7 +16,7 @@ from stillmap.core.arrays import empty, squared_lengths
 from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.core.source import Skipped, Source
-from stillmap.core.timestamps import MAX_BEAM_TIME
+from stillmap.core.timestamps import MAX_BEAM_TIME, order_in_time
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.prepare.options import MAX_POINT_DISTANCE, ReadOptions
 
@@ -195,6 +195,8 @@ def reorder_scans(
 
 MAX_LINE_NUMBERS = 1000
 
+TIME_BACKWARDS = "time running backwards"
+
 _MAX_LOSS = 0.05  # share of scans that may be skipped without a warning
 
 
@@ -210,6 +212,16 @@ class SkippedRecords:
     def add_all(self, reason: str, numbers: Iterable[int]) -> None:
         for number in numbers:
             self._numbers.setdefault(reason, array("q")).append(number)
+
+    def order_in_time(self, stamp_ns: Int64, numbers: Int64) -> Index:
+        """Indices of records in order of time; those without a place in it are counted.
+
+        Args:
+            stamp_ns, numbers: (T,) of the records in the order in which they were recorded.
+        """
+        order = order_in_time(stamp_ns)
+        self.add_all(TIME_BACKWARDS, np.delete(numbers, order))
+        return order
 
     def merge(self, *others: "SkippedRecords") -> "SkippedRecords":
         """The sum of these and others; neither is changed."""

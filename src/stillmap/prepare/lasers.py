@@ -59,8 +59,9 @@ class RawLaser:
 
     @cached_property
     def typical_shape(self) -> int:
-        """The geometry of most scans."""
-        return int(np.bincount(self.shape, minlength=len(self.directions)).argmax())
+        """The most frequent geometry with as many beams as most scans."""
+        usual = np.bincount(self.lengths, minlength=1).argmax()
+        return int(np.bincount(self.shape[self.lengths == usual], minlength=1).argmax())
 
     def sample_readings(self) -> Float32:
         """(K, n) readings of K scans evenly spread over the recording, padded with NaN."""

@@ -50,21 +50,63 @@ def test_front_and_rear_laser(read_log, flaser):
     recording = read_log(
         [
             flaser(1.0, pose=(1.0, 0, 0)),
-            flaser(1.2, [5.0, 6.0], kind="RLASER"),
-            flaser(1.1, [5.5, 6.5], pose=(1.1, 0, 0), kind="RLASER"),  # decreasing stamp
+            flaser(1.2, [5.0, 6.0], pose=(1.2, 0, 0), kind="RLASER"),
+            flaser(1.1, [5.5, 6.5], pose=(1.1, 0, 0), kind="RLASER"),  # late
             flaser(1.15, pose=(1.15, 0, 0)),
             flaser(2.0, [7.0, 8.0], pose=(2.0, 0, 0), kind="RLASER"),
         ]
     )
-    # one of 1.2 and 1.1 is dropped; the front laser's 1.15 does not matter
-    assert recording.stamp_ns.tolist() == [10**9, 1_100_000_000, 1_150_000_000, 2 * 10**9]
-    assert recording.sensor.tolist() == [0, 1, 0, 1]
-    np.testing.assert_array_equal(recording.T_odom_base[:, 0, 2], [1.0, 1.1, 1.15, 2.0])
+    np.testing.assert_array_equal(recording.stamp_ns / 1e9, [1.0, 1.1, 1.15, 1.2, 2.0])
+    assert recording.sensor.tolist() == [0, 1, 0, 1, 1]
+    np.testing.assert_array_equal(recording.T_odom_base[:, 0, 2], recording.stamp_ns / 1e9)
     x, y, theta = se2.parameters(recording.T_base_sensor[1])
     assert (x, y, abs(theta)) == (0.0, 0.0, pytest.approx(math.pi))
-    rear_last = recording.points[recording.beams_of(3)]
-    np.testing.assert_allclose(np.linalg.norm(rear_last, axis=1), [7.0, 8.0], rtol=1e-6)
-    assert recording.source.skipped["time running backwards"].count == 1
+    lengths = np.linalg.norm(recording.points[4:], axis=1)
+    np.testing.assert_allclose(lengths, [5.5, 6.5, 1, 2, 3, 4, 5, 6, 7, 8], rtol=1e-6)
+    assert recording.source.skipped == {}
+
+
+@pytest.mark.parametrize("own_poses", [True, False])
+@pytest.mark.parametrize(("back", "kept"), [(30.1, 239), (1000.0, 198)])
+def test_late_lines_are_sorted_and_a_clock_set_back_is_none(
+    read_log, flaser, own_poses, back, kept
+):
+    """A robot drives 1 m/s; its scans come in pairs, the later one first; x in m is the time in s,
+    the first reading is the centimetres of it. After 100 s the clock is set back."""
+    lines = []
+    for k in range(0, 300):
+        t = (k ^ 1) * 0.5
+        stamp = t if t < 100.0 else t - back
+        pose = (t, 0, 0)
+        lines.append(f"ODOM {k * 0.5} 0 0 0 0 0 {k * 0.5 - (k >= 200) * back} host 0")
+        lines.append(flaser(stamp, [1.0 + 0.01 * t, 2.0], pose if own_poses else (0, 0, 0)))
+    recording = read_log(lines)
+    x, read = recording.T_odom_base[:, 0, 2], np.linalg.norm(recording.points[::2], axis=1)
+    # odometry lines and scans may leave the first clock at another scan
+    wrong = np.abs(1.0 + 0.01 * x - read) > 1e-5
+    assert np.count_nonzero(wrong) <= (not own_poses)
+    assert np.all(np.diff(x) > 0.0)
+    assert np.count_nonzero(np.diff(x) > 2.0) <= 1, "it leaps where the clock was set"
+    assert recording.n_scans == kept
+    assert recording.source.skipped["time running backwards"].count == 300 - kept
+
+
+def test_interlaced_scans_have_angles_of_their_own(read_log):
+    """A laser of a degree that looks a quarter of one further in each of four scans."""
+    lines = []
+    for k in range(40):
+        start, n = -90.0 + 0.25 * (k % 4), 181 if k % 4 == 0 else 180
+        header = f"0 {math.radians(start)} {math.radians(n - 1)} {math.radians(1.0)} 50 0.01 0"
+        readings = " ".join(["4.0"] * n)
+        lines.append(f"ROBOTLASER1 {header} {n} {readings} 0 0 0 0 {k} 0 0 0 0 0 0 0 {k} host {k}")
+    recording = read_log(lines)
+    assert recording.source.skipped == {}
+    assert recording.source.sensors[0].beams_per_scan == 180
+    np.testing.assert_array_equal(np.diff(recording.offset), [181, 180, 180, 180] * 10)
+    angles = np.degrees(np.arctan2(recording.points[:, 1], recording.points[:, 0]))
+    for k in range(recording.n_scans):
+        own = angles[recording.beams_of(k)]
+        np.testing.assert_allclose(own, -90.0 + 0.25 * (k % 4) + np.arange(len(own)), atol=1e-4)
 
 
 def test_rawlaser_interpolates_odometry(read_log):

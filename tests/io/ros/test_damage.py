@@ -11,8 +11,9 @@ from small_bags import Messages, write_bag
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
+from stillmap.io.builder import TIME_BACKWARDS
 from stillmap.io.ros import lasers
-from stillmap.io.ros.messages import TIME_BACKWARDS, UNREADABLE
+from stillmap.io.ros.messages import UNREADABLE
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -91,14 +92,17 @@ def test_numbers_of_beams_may_vary(bag, messages):
 
 
 def test_decreasing_and_repeated_stamps(bag, messages):
-    stamps = [0, 1, 2, 2, 9, 3, 3, 4]
-    readings = [1.0, 2.0, 3.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    stamps = [0, 1, 2, 2, 9, 3, 3, 4, 3.5]
+    readings = [1.0, 2.0, 3.0, 3.0, 4.0, 5.0, 6.0, 7.0, 6.5]
     content = [
-        ("/scan", START + k, messages.scan(START + s * SECOND, np.full(4, r)))
+        ("/scan", START + k, messages.scan(START + int(s * SECOND), np.full(4, r)))
         for k, (s, r) in enumerate(zip(stamps, readings, strict=True))
     ]
     recording = read(bag(content))
-    np.testing.assert_array_equal((recording.stamp_ns - START) // SECOND, [0, 1, 2, 3, 3, 4])
+    np.testing.assert_array_equal((recording.stamp_ns - START) / SECOND, [0, 1, 2, 3, 3, 3.5, 4])
+    lengths = np.linalg.norm(recording.points[::4], axis=1)
+    np.testing.assert_allclose(lengths, [1.0, 2.0, 3.0, 5.0, 6.0, 6.5, 7.0])
+    np.testing.assert_array_equal(recording.record, [1, 2, 3, 6, 7, 9, 8])
     assert skipped(recording) == {TIME_BACKWARDS: 1, lasers.REPEATED: 1}
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float, Int64
-from stillmap.core.timestamps import longest_non_decreasing, parse_ns
+from stillmap.core.timestamps import parse_ns
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
 from stillmap.prepare.lasers import RawLaser
@@ -35,8 +35,6 @@ from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
 BAD_LINE = "line that cannot be read"
-TIME_BACKWARDS = "time running backwards"
-WRONG_COUNT = "other number of readings than most scans"
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 # fields of the poses, and what follows them, between the readings and the stamp, by kind of line
@@ -54,10 +52,11 @@ _MAX_UNKNOWN_KINDS = 50  # counted one by one; a text that is no log has thousan
 
 
 class ScanConfig(NamedTuple):
-    """Beam angles of a scan, and its declared maximum range."""
+    """Beam angles of a scan, its number of readings and its declared maximum range."""
 
     start_angle: float  # rad
     angle_step: float  # rad
+    n: int
     max_range: float | None = None  # m
 
 
@@ -81,7 +80,7 @@ def flaser_config(n: int, fov: float = math.pi) -> ScanConfig:
     Likewise for another field of view `fov`, in radians.
     """
     steps = n if n % 2 == 0 else max(n - 1, 1)
-    return ScanConfig(-fov / 2, fov / steps)
+    return ScanConfig(-fov / 2, fov / steps, n)
 
 
 def first_reading(kind: bytes) -> int:
@@ -114,7 +113,7 @@ def _parse_odometry(fields: list[bytes]) -> ScanLine:
     if not _is_stamp(fields[6:]):
         raise ValueError(BAD_LINE)
     pose, stamp_ns = _parse_pose(fields[0:3]), parse_ns(fields[6].decode("ascii"))
-    return ScanLine(stamp_ns, [], ScanConfig(0.0, 0.0), tuple(pose), fields[6:])
+    return ScanLine(stamp_ns, [], ScanConfig(0.0, 0.0, 0), tuple(pose), fields[6:])
 
 
 def _parse_count(fields: list[bytes], at: int, least: int = 1) -> int:
@@ -165,27 +164,25 @@ def _parse_header(header: list[bytes], n: int) -> ScanConfig:
         step = fov / max(n - 1, 1)
     if not (0.0 < step < math.pi and abs(start) <= 4.0 * math.pi):
         raise ValueError(BAD_LINE)
-    return ScanConfig(start, step, max_range if 0.0 < max_range < math.inf else None)
+    return ScanConfig(start, step, n, max_range if 0.0 < max_range < math.inf else None)
 
 
 class LaserLog:
     """The scans of one kind of line (`FLASER`), in log order.
 
     Attributes:
-        rows: line, stamp, count of readings, config and whether the host is a number, of each scan.
+        rows: line, stamp, config and whether the host is a number, of each scan.
         ranges: readings of all scans, one after the other.
         configs: their numbers.
         poses: laser x y theta, robot x y theta of each scan, if there are any.
 
-    Attributes of the T usable scans, once they are selected:
+    Attributes of the T usable scans, in order of time, once they are selected:
         line, stamp_ns: (T,) line numbers, from 1, and stamps.
-        n_readings: of each.
         robot_poses, laser_poses: (T, 3) on the lines; None: they have none.
     """
 
     line: Int64
     stamp_ns: Int64
-    n_readings: int
     laser_poses: Float | None = None
     robot_poses: Float | None = None
 
@@ -195,32 +192,25 @@ class LaserLog:
         self.configs: dict[ScanConfig, int] = {}
 
     def __len__(self) -> int:
-        return len(self.rows) // 5
+        return len(self.rows) // 4
 
     def add(self, line: int, scan: ScanLine) -> None:
         # in a log with named hosts a number is a sign of shifted fields
         is_number = len(scan.stamp) > 1 and _is_number(scan.stamp[1])
         config = self.configs.setdefault(scan.config, len(self.configs))
-        self.rows.extend((line, scan.stamp_ns, len(scan.ranges), config, is_number))
+        self.rows.extend((line, scan.stamp_ns, config, is_number))
         self.ranges.extend(scan.ranges)
         self.poses.extend(scan.poses)
 
     def select_usable(self, skipped: SkippedRecords) -> None:
-        """Select the scans with the typical number of readings and non-decreasing stamps.
-
-        The longest non-decreasing subsequence of the laser's stamps is kept, so that a stamp that
-        jumps ahead costs one scan. Stamps of different lasers need not be in order.
-        """
-        line, stamps, count, config, shifted = np.asarray(self.rows).reshape(-1, 5).T
-        # the most frequent number, the larger of equally frequent ones
-        typical = max(Counter(count.tolist()).items(), key=lambda item: (item[1], item[0]))[0]
-        usable = (count == typical) & ~((shifted > 0) & (shifted.mean() < 0.5))
-        skipped.add_all(WRONG_COUNT, line[~usable])
-        scans = np.flatnonzero(usable)
-        forward = longest_non_decreasing(stamps[scans].tolist())
-        skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
-        scans = scans[forward]
-        self.n_readings, self.line, self.stamp_ns = typical, line[scans], stamps[scans]
+        """Select the scans in order of time. Stamps of different lasers need not be in order."""
+        line, stamps, config, is_number = np.asarray(self.rows).reshape(-1, 4).T
+        shifted = (is_number > 0) & (is_number.mean() < 0.5)
+        skipped.add_all(BAD_LINE, line[shifted])
+        scans = np.flatnonzero(~shifted)
+        scans = scans[skipped.order_in_time(stamps[scans], line[scans])]
+        self.line, self.stamp_ns = line[scans], stamps[scans]
+        count = np.array([one.n for one in self.configs])[config]
         self._start, self._shape = (np.cumsum(count) - count)[scans], config[scans]
         if len(self.poses):
             poses = np.asarray(self.poses).reshape(-1, 6)[scans]
@@ -240,7 +230,7 @@ class CarmenLog:
     def __init__(self, window: TimeWindow) -> None:
         self._window = window
         self.lasers: dict[str, LaserLog] = {}
-        self.odom_stamp_ns, self.odom_poses = array("q"), array("d")
+        self.odom_rows, self.odom_poses = array("q"), array("d")  # rows: line and stamp
         self.params: dict[str, str] = {}
         self.records: Counter[str] = Counter()
         self.ignored: Counter[str] = Counter()
@@ -286,7 +276,7 @@ class CarmenLog:
         self.records[kind] += 1
         self._stamp_fields[name] = len(record.stamp)
         if is_pose:
-            self.odom_stamp_ns.append(record.stamp_ns)
+            self.odom_rows.extend((line.number, record.stamp_ns))
             self.odom_poses.extend(record.poses)
         elif self._window.select(record.stamp_ns):
             self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, record)

@@ -26,7 +26,6 @@ from stillmap.prepare.lasers import RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
-TIME_BACKWARDS = "time running backwards"
 _HEAD = 1 << 18  # bytes with the PARAM lines of a log
 _KIND_ORDER = ("ROBOTLASER", "FLASER", "RLASER", "RAWLASER")  # preference for the same laser
 # differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
@@ -107,9 +106,12 @@ def _describe_lasers(used: list[LaserLog], log: CarmenLog, options: ReadOptions)
         upside_down, upside_down_how = _find_upside_down(laser.kind, log.params, given)
         angles = _find_angles(laser, log.params, given, warnings)
         angles = -angles if upside_down else angles
-        every = angles[:, :1] + angles[:, 1:] * np.arange(laser.n_readings)
-        max_range = _find_max_range(laser, log.params)
-        raw = laser.raw([unit_vectors(row) for row in every], max_range)
+        counts = [config.n for config in laser.configs]
+        directions = [
+            unit_vectors(first + step * np.arange(n))
+            for (first, step), n in zip(angles, counts, strict=True)
+        ]
+        raw = laser.raw(directions, _find_max_range(laser, log.params))
         first, step = angles[raw.typical_shape].tolist()
         lasers.append(raw)
         mounts.append(pose.matrix()[None])
@@ -117,7 +119,7 @@ def _describe_lasers(used: list[LaserLog], log: CarmenLog, options: ReadOptions)
             SensorNotes(
                 laser.kind,
                 scans=len(laser.line),
-                beams_per_scan=laser.n_readings,
+                beams_per_scan=counts[raw.typical_shape],
                 start_angle=first,
                 angle_step=step,
                 upside_down=upside_down,
@@ -232,19 +234,18 @@ def _find_angles(
     laser: LaserLog, params: dict[str, str], given: LaserOptions, warnings: list[str]
 ) -> Float:
     """(C, 2) first angle and step in radians of each of the laser's configs, as declared."""
-    kind, n = laser.kind, laser.n_readings
-    angles = np.array([config[:2] for config in laser.configs])
+    kind, configs = laser.kind, list(laser.configs)
     if kind in WITHOUT_ANGLES:
         fov = given.fov
         degrees = _param(params, f"laser_{_position(kind, params)}_laser_fov")
         if fov is None and degrees is not None and 0.0 < degrees <= 360.0:
             fov = math.radians(degrees)
         if fov is not None:
-            angles[:] = flaser_config(n, fov)[:2]
+            configs = [flaser_config(config.n, fov) for config in configs]
     elif given.fov is not None:
         text = "its lines declare their angles: the given field of view is not used"
         warnings.append(f"{kind}: {text}")
-    return angles
+    return np.array([config[:2] for config in configs])
 
 
 def _find_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
@@ -266,8 +267,9 @@ def _find_odometry(
     The pose on the scan line comes first, else ODOM lines, else poses on other lasers' lines are
     interpolated. Poses on scan lines that never change while ODOM lines do are ignored.
     """
-    odom_ns = np.asarray(log.odom_stamp_ns, np.int64)
-    odom = np.asarray(log.odom_poses).reshape(-1, 3)
+    line, odom_ns = np.asarray(log.odom_rows).reshape(-1, 2).T
+    order = log.skipped_odometry.order_in_time(odom_ns, line)
+    odom_ns, odom = odom_ns[order], np.asarray(log.odom_poses).reshape(-1, 3)[order]
     own = {laser.kind: laser.robot_poses for laser in lasers if laser.robot_poses is not None}
     if len(odom) and own and not any(map(_moves, own.values())) and _moves(odom):
         own = {}
@@ -284,7 +286,7 @@ def _find_odometry(
         poses.append(at_scans)
         outside += n_outside
     out = np.concatenate(poses)
-    interpolated = "ODOM lines" if len(log.odom_stamp_ns) else "other lasers' scan lines"
+    interpolated = "ODOM lines" if len(log.odom_rows) else "other lasers' scan lines"
     kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(lasers) else [])
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")

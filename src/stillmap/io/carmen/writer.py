@@ -130,8 +130,8 @@ def _choose_format(recording: Recording) -> tuple[list[LaserFormat], Float, dict
     """Line formats of one or two lasers, first angle and step (T, 2) of each scan, PARAM lines."""
     n_lasers = len(recording.T_base_sensor)
     counts = np.diff(recording.offset)
-    for number in range(n_lasers):
-        _require_one_count(counts[recording.sensor == number])
+    if np.any(counts == 0):
+        raise InputError("a CARMEN log holds no scan without beams", hint=_ALTERNATIVE)
     angles = laser_scan.beam_angles(recording)
     params = {}
     for number, position in enumerate(_POSITIONS[:n_lasers]):
@@ -151,14 +151,6 @@ def _choose_format(recording: Recording) -> tuple[list[LaserFormat], Float, dict
         x, y, theta = se2.parameters(recording.T_base_sensor[number]).tolist()
         params |= _extrinsics_params(kinds[number], _POSITIONS[number], x, y, theta)
     return lasers, angles, params
-
-
-def _require_one_count(counts: Int64) -> None:
-    sizes = np.unique(counts)
-    if len(sizes) > 1 or np.any(sizes == 0):
-        what = "in a CARMEN log all scans of a laser have the same number"
-        text = f"scans of {sizes.min()} to {sizes.max()} beams: {what}"
-        raise InputError(text, hint=_ALTERNATIVE)
 
 
 def _is_upside_down(angles: Float) -> bool:
@@ -230,7 +222,7 @@ def write_filtered(job: FilterJob) -> Omissions:
     scan_of = {number: t for t, number in enumerate(lines.tolist())}
     codes = [
         find_no_return_code(
-            own.raw([np.empty((own.n_readings, 2))] * len(own.configs)).sample_readings(),
+            own.raw([np.empty((config.n, 2)) for config in own.configs]).sample_readings(),
             notes.ranges,
         )
         for own, notes in zip(lasers, recording.source.sensors, strict=True)

@@ -14,7 +14,6 @@ from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes, Source
-from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.clouds import Cloud
 from stillmap.io.point_cloud.table import (
@@ -24,7 +23,6 @@ from stillmap.io.point_cloud.table import (
 )
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
-    TIME_BACKWARDS,
     Message,
     SkippedByTopic,
     frame_name,
@@ -145,13 +143,12 @@ class CloudCollector:
         self.number.append(number)
         return None
 
-    def forward_scans(self, sensor: int) -> Index:
-        """The scans of a sensor with non-decreasing stamps; others are counted."""
+    def scans_in_time(self, sensor: int) -> Index:
+        """The scans of a sensor in order of time; others are counted."""
         rows = np.flatnonzero(np.asarray(self.scans.sensor) == sensor)
-        keep = longest_non_decreasing(np.asarray(self.scans.stamp_ns)[rows].tolist())
+        stamps, number = np.asarray(self.scans.stamp_ns)[rows], np.asarray(self.number)[rows]
         topic, _ = list(self.sensors)[sensor]
-        self.skipped[topic].add_all(TIME_BACKWARDS, np.delete(np.asarray(self.number)[rows], keep))
-        return rows[keep]
+        return rows[self.skipped[topic].order_in_time(stamps, number)]
 
 
 def read_clouds(
@@ -177,7 +174,7 @@ def read_clouds(
     sensors = [tf.Sensor(*names[k], stamps[sensor == k]) for k in order]
     poses = tf.place_sensors(tree, sensors, options)
     chosen = [order[k] for k in poses.used]
-    rows = [clouds.forward_scans(k) for k in chosen]
+    rows = [clouds.scans_in_time(k) for k in chosen]
     T, warnings = np.tile(np.eye(4), (len(names), 1, 1)), list(poses.warnings)
     for k, of_scans in zip(chosen, poses.T_base_sensor, strict=True):
         T[k] = of_scans[0]

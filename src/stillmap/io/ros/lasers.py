@@ -17,12 +17,10 @@ from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.errors import InputError, advise
 from stillmap.core.source import LaserPose, SensorNotes, Source
-from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
     MULTI_ECHO,
-    TIME_BACKWARDS,
     Message,
     SkippedByTopic,
     frame_name,
@@ -102,7 +100,7 @@ class LaserScans:
         return None
 
     def finish(self, skipped: SkippedRecords) -> None:
-        """Keep the scans with non-decreasing stamps, without repeated ones; others are counted."""
+        """Keep the scans in order of time, without repeated ones; others are counted."""
         ranges, shapes = self._ranges.finish(), list(self._shapes)
         stamps, log_ns, number, shape = np.asarray(self._rows, np.int64).reshape(-1, 4).T.copy()
         n = np.array([s.n for s in shapes], np.int64)[shape]
@@ -112,8 +110,7 @@ class LaserScans:
             what = f"{self.topic}: headers have no stamps: log times are used"
             todo = "let the driver stamp its scans: log times come later and jitter"
             self.warnings.append(advise(what, todo))
-        keep = longest_non_decreasing(stamps.tolist())
-        skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
+        keep = skipped.order_in_time(stamps, number)
         repeated = np.zeros(len(keep), np.bool_)
         for k in np.flatnonzero(np.diff(stamps[keep]) == 0) + 1:
             a, b = (ranges[start[t] : start[t] + n[t]] for t in keep[[k - 1, k]])

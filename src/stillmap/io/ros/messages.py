@@ -34,7 +34,6 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 UNREADABLE = "message that cannot be decoded"
-TIME_BACKWARDS = "time running backwards"
 
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 

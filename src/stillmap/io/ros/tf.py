@@ -11,6 +11,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
+from stillmap.core.timestamps import order_in_time
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.io.trajectory import MAX_TRANSLATION
@@ -64,9 +65,11 @@ class Motion:
         return True
 
     def sort(self) -> None:
-        """Sort by time, without duplicate stamps (the last one counts); note that it is constant if
-        all values are equal."""
-        stamps, values = np.asarray(self.stamp_ns, np.int64), np.asarray(self.values).reshape(-1, 7)
+        """Order in time, without duplicate stamps (the last one counts); note that it is constant
+        if all values are equal."""
+        order = order_in_time(np.asarray(self.stamp_ns, np.int64))
+        stamps = np.asarray(self.stamp_ns, np.int64)[order]
+        values = np.asarray(self.values).reshape(-1, 7)[order]
         last = len(stamps) - 1 - np.unique(stamps[::-1], return_index=True)[1]
         self.constant = self.constant or bool(np.all(values == values[last[0]]))
         self.stamp_ns = array("q", stamps[last].tolist())

@@ -211,8 +211,8 @@ def to_seconds(stamp_ns: NDArray[np.int64]) -> Float:
 
 
 def _log_rows(log: CarmenLog) -> Float:
-    if len(log.odom_stamp_ns):
-        stamps, poses = np.asarray(log.odom_stamp_ns), np.asarray(log.odom_poses).reshape(-1, 3)
+    if len(log.odom_rows):
+        stamps, poses = np.asarray(log.odom_rows)[1::2], np.asarray(log.odom_poses).reshape(-1, 3)
         return np.column_stack([to_seconds(stamps), poses])
     for laser in log.lasers.values():
         if len(laser.poses):
