@@ -83,3 +83,14 @@ def test_return_to_the_same_room():
     assert found.diagnostics.unconnected == []
     truth = np.concatenate([once.truth.T_world_base] * 2)
     assert compute_absolute_errors(found.poses, truth).rmse < 0.02
+
+
+def test_a_pause_is_no_proof_that_the_robot_was_carried():
+    # a logger that stops for two minutes; odometry goes on from where it was
+    once = drive(2, laser={"beams": 120, "range_noise": 0.01, "max_range": 20.0})
+    stamp_ns = once.recording.stamp_ns.copy()
+    stamp_ns[len(stamp_ns) // 2 :] += 120 * 10**9
+    found = mapped(dataclasses.replace(once.recording, stamp_ns=stamp_ns))
+    assert found.diagnostics.breaks == []
+    assert ate(found, once.truth) < 0.05
+    assert np.allclose(found.poses, mapped(once.recording).poses, atol=0.02)

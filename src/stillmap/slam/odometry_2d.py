@@ -184,8 +184,6 @@ class _ScanOdometry:
         grid, usual = self.local_map.grid, self.usual[self.recording.sensor[t]]
         if len(scan.points) == 0 or usual == 0.0:
             return match, False
-        if relocalization.is_gap(float(self.seconds_before[t]), self.seconds):
-            return self._start_segment(t, prior), False
         if is_poor(match, usual):
             match = self._match_late_odometry(t, scan, match, usual)
         if is_poor(match, usual):

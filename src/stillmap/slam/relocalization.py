@@ -31,11 +31,10 @@ _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
 # the many that are tried must be better than that of odometry
 _MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN, _MARGIN_SHARE = 3, 4, 8, 0.3
 _MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
-# keyframes that must contradict the place of odometry, in all and as a share, or it is believed;
-# the share where scans follow each other without a gap, in which nobody carries a robot far
-_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE, _MIN_SHARE_WITHOUT_GAP = 5, 0.33, 0.5
+# keyframes that must contradict the place of odometry, in all and as a share, or it is believed
+_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.5
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
-_DRIFT_DISTANCE, _DRIFT_ANGLE = 1.5, 0.3  # m, rad: smaller displacements are drift of odometry
+_DRIFT_DISTANCE = 1.5  # m: smaller displacements are drift of odometry
 _STALL_TIME = 5.0  # s for which odometry may stand still unnoticed while the robot drives on
 _SEGMENT_SPACING = 10.0  # m between unconnected segments
 
@@ -125,14 +124,12 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         if here.is_supported:
             continue
         there = _find_placement(context, before, first, last)
-        has_gap = _has_gap_before(context, first)
-        min_share = _MIN_CONTRADICTING_SHARE if has_gap else _MIN_SHARE_WITHOUT_GAP
         if there is not None and there.is_better(here):
-            if _exceeds_odometry_error(context, there.C, first, has_gap=has_gap):
+            if _exceeds_odometry_error(context, there.C, first):
                 out.breaks.append(first)
             poses[first:last] = there.C @ poses[first:last]
             out.closures.extend(there.closures)
-        elif here.is_contradicted(min_share):
+        elif here.is_contradicted(_MIN_CONTRADICTING_SHARE):
             poses[first:last] = _offset_beside(context, first) @ poses[first:last]
             out.breaks.append(first)
             out.unconnected.append(first)
@@ -141,24 +138,12 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
 
 
-def _has_gap_before(context: LoopContext, first: int) -> bool:
-    """True if a gap in time precedes scan `first`, in which the robot may have been carried."""
-    seconds = 1e-9 * np.diff(context.recording.stamp_ns)
-    return is_gap(float(seconds[first - 1]), float(np.median(seconds)))
-
-
-def _exceeds_odometry_error(context: LoopContext, C: Float, first: int, *, has_gap: bool) -> bool:
-    """True if a segment is displaced by C (3, 3) farther than odometry drifts or a stall hides.
-
-    Drift: in a blind stretch for example. A stall: where no gap in time precedes the segment.
-    """
-    x, y, theta = se2.parameters(se2.inverse(context.poses[first]) @ C @ context.poses[first])
-    metres = float(np.hypot(x, y))
-    if has_gap:
-        return metres > _DRIFT_DISTANCE or abs(theta) > _DRIFT_ANGLE
+def _exceeds_odometry_error(context: LoopContext, C: Float, first: int) -> bool:
+    """True if a segment is displaced by C (3, 3) farther than odometry drifts or a stall hides."""
+    x, y, _ = se2.parameters(se2.inverse(context.poses[first]) @ C @ context.poses[first])
     seconds = 1e-9 * float(context.recording.stamp_ns[-1] - context.recording.stamp_ns[0])
     speed = float(local_map.travelled_distance(context.poses)[-1]) / max(seconds, 1e-9)
-    return metres > max(_DRIFT_DISTANCE, _STALL_TIME * speed)
+    return float(np.hypot(x, y)) > max(_DRIFT_DISTANCE, _STALL_TIME * speed)
 
 
 def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
@@ -287,8 +272,6 @@ _MAX_SCANS = 300  # ahead
 _MIN_CONTRADICTING_SCANS, _ENOUGH_DECISIVE, _MIN_TRAVEL = 6, 20, 3.0
 _CONTRADICTION_RATIO = 4.0  # contradicting scans for each one that agrees
 _AGREE_SHARE, _CONTRADICT_SHARE = 0.6, 0.4  # explained, of the usual share
-# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere
-_GAP, _GAP_RATIO = 5.0, 20.0
 _DRIFT, _MIN_STD = 0.04, 0.05  # m and rad of odometry error per m or rad, and at least
 
 
@@ -298,16 +281,6 @@ class Evidence(Enum):
     AGREES = "agrees"
     CONTRADICTS = "contradicts"
     UNKNOWN = "unknown"
-
-
-def is_gap(seconds: float, usual: float) -> bool:
-    """True if the time between two scans is a gap, in which the robot may have been carried.
-
-    Args:
-        seconds: between them.
-        usual: s between scans.
-    """
-    return seconds > max(_GAP, _GAP_RATIO * usual)
 
 
 def judge_scan(grid: _core.OccupancyGrid2D, scan: Scan, match: ScanMatch, usual: float) -> Evidence:
