@@ -23,6 +23,7 @@ LOGS = {
     "aces": (0.3, None),
     "belgioioso": (0.1, None),
     "edmonton": (0.1, None),
+    "fhw": (0.1, None),  # pauses of 34 to 230 s without scans
     "fr101": (0.1, None),
     "seattle": (0.15, None),
 }
