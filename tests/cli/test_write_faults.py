@@ -55,7 +55,6 @@ WRITERS = {
     "merge": Writer(("merge", "ROOM", "RESULT", *_SMALL)),
     "live": Writer(("live", "--replay", "ROOM")),
     "simulate": Writer(("simulate", "hall", "--scans", "9"), is_quick=True),
-    "simulate-carmen": Writer(("simulate", "hall", "--scans", "9", "--format", "carmen")),
     "simulate-sessions": Writer(("simulate", "office", "--scans", "9", "--sessions", "2")),
     "convert-folder": Writer(("convert", "ROOM"), is_quick=True),
     "convert-ros2": Writer(("convert", "ROOM", "--to", "ros2")),

@@ -52,8 +52,8 @@ def enter_local_frame(
 
 
 def move_odometry(recording: Recording, metres: Float) -> Recording:
-    """The recording with its odometry that many metres (3,) farther."""
-    if recording.T_odom_base is None:
+    """The recording with its odometry that many metres (3,) farther; itself where it is 0."""
+    if recording.T_odom_base is None or not metres.any():
         return recording
     return dataclasses.replace(recording, T_odom_base=shift_poses(recording.T_odom_base, metres))
 

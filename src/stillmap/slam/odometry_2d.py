@@ -187,6 +187,10 @@ class _ScanOdometry:
         if is_poor(match, usual):
             match = self._match_late_odometry(t, scan, match, usual)
         if is_poor(match, usual):
+            # one scan that fits somewhere near tells no fault of odometry from a robot carried
+            # away while nothing was recorded: all that follow decide
+            if relocalization.is_gap(float(self.seconds_before[t]), self.seconds):
+                return self._start_segment(t, prior), False
             # odometry that stands still may have stalled
             min_gain = ODOMETRY_FAULT if self.slip.has_stopped(t) else FAULT_GAIN
             wider = widen_match(grid, scan, prior, other, match, usual, min_gain)

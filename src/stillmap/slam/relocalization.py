@@ -275,6 +275,20 @@ _AGREE_SHARE, _CONTRADICT_SHARE = 0.6, 0.4  # explained, of the usual share
 _DRIFT, _MIN_STD = 0.04, 0.05  # m and rad of odometry error per m or rad, and at least
 
 
+# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere
+_GAP, _GAP_RATIO = 5.0, 20.0
+
+
+def is_gap(seconds: float, usual: float) -> bool:
+    """True if the time between two scans is a gap, in which the robot may have been carried.
+
+    Args:
+        seconds: between them.
+        usual: s between scans.
+    """
+    return seconds > max(_GAP, _GAP_RATIO * usual)
+
+
 class Evidence(Enum):
     """Relation of a matched scan to the map."""
 
