@@ -36,10 +36,16 @@ def test_velocity_noise_floor(seconds, metres, radians):
 
 def test_leaps_are_implausible_steps():
     x = np.cumsum([0.0, *[0.3] * 30, 40.0, *[0.3] * 30])
-    steps = motion_model.compute_odometry_steps(se2.matrix(x, 0 * x, 0 * x))
+    stamp_ns = 10**8 * np.arange(len(x))
+    odometry = se2.matrix(x, 0 * x, 0 * x)
+    steps = motion_model.compute_odometry_steps(odometry, stamp_ns)
     np.testing.assert_array_equal(np.flatnonzero(~steps.plausible), [30])
     np.testing.assert_allclose(steps.increments[:, 0, 2], np.diff(x))
-    assert motion_model.compute_odometry_steps(T0[None]).plausible.shape == (0,)
+    empty = motion_model.compute_odometry_steps(T0[None], stamp_ns[:1])
+    assert empty.plausible.shape == (0,)
+    # the robot drove on for 20 s in which no scan was recorded
+    stamp_ns[31:] += 20 * 10**9
+    assert motion_model.compute_odometry_steps(odometry, stamp_ns).plausible.all()
 
 
 def test_mean_and_standard_deviations_by_hand():
@@ -51,6 +57,12 @@ def test_mean_and_standard_deviations_by_hand():
     assert prior.translation_std == pytest.approx(0.24)
     assert prior.rotation_std == pytest.approx(0.27)
     np.testing.assert_allclose(prior.information, np.diag([0.24**-2, 0.24**-2, 0.27**-2]))
+
+
+def test_errors_of_many_metres_add_up_as_a_random_walk():
+    # 9 m and 2.25 rad: 0.02 + 0.2 * 3 + 0.3 * 1.5 m, 0.02 + 0.1 * 3 + 0.5 * 1.5 rad
+    std = motion_model.odometry_std(9.0, 2.25, OdometryOptions(0.2, 0.3, 0.1, 0.5))
+    assert std == pytest.approx((1.07, 1.07))
 
 
 def test_long_chains_stay_orthonormal():

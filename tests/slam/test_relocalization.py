@@ -90,7 +90,9 @@ def test_a_pause_is_no_proof_that_the_robot_was_carried():
     once = drive(2, laser={"beams": 120, "range_noise": 0.01, "max_range": 20.0})
     stamp_ns = once.recording.stamp_ns.copy()
     stamp_ns[len(stamp_ns) // 2 :] += 120 * 10**9
-    found = mapped(dataclasses.replace(once.recording, stamp_ns=stamp_ns))
-    assert found.diagnostics.breaks == []
-    assert ate(found, once.truth) < 0.05
-    assert np.allclose(found.poses, mapped(once.recording).poses, atol=0.02)
+    paused = mapped(dataclasses.replace(once.recording, stamp_ns=stamp_ns))
+    assert paused.diagnostics.breaks == []
+    assert ate(paused, once.truth) < 0.05
+    # the scan after it is matched, not taken where odometry leads
+    usual = mapped(once.recording)
+    np.testing.assert_allclose(paused.explained, usual.explained, atol=0.05)

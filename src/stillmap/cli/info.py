@@ -65,7 +65,7 @@ def _summarize(path: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _summarize_overlap(summaries: list[dict[str, Any]], args: argparse.Namespace) -> dict[str, Any]:
-    """What is left out of parts of one run that overlap, as `stillmap map` joins them."""
+    """Number of scans that `stillmap map` uses of overlapping parts of one run, and skips."""
     from stillmap.core.json import to_jsonable
     from stillmap.pipeline import inputs
 

@@ -83,7 +83,7 @@ class CheckedOptions:
 
 
 class Declaration(NamedTuple):
-    """What a class says about one of its options.
+    """Type, limits, default and documentation of an option.
 
     Attributes:
         kind: its type where it is set.
@@ -114,7 +114,9 @@ def declared_options(kind: Any) -> dict[str, Declaration]:
 @cache
 def _declare_all(kind: type[CheckedOptions]) -> dict[str, Declaration]:
     hints = typing.get_type_hints(kind, include_extras=True)
-    fields = [one for one in dataclasses.fields(kind) if not dataclasses.is_dataclass(one.default)]
+    fields = [
+        field for field in dataclasses.fields(kind) if not dataclasses.is_dataclass(field.default)
+    ]
     return {field.name: _declare(field, hints[field.name]) for field in fields}
 
 
@@ -249,15 +251,19 @@ def to_dict(options: Any) -> dict[str, Any]:
 
 def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
     """All options, section by section; options of a section come before its sub-sections."""
-    for name, one in declared_options(type(options)).items():
+    for name, declared in declared_options(type(options)).items():
         kind = (
-            "list" if typing.get_origin(one.kind) is tuple else getattr(one.kind, "__name__", "str")
+            "list"
+            if typing.get_origin(declared.kind) is tuple
+            else getattr(declared.kind, "__name__", "str")
         )
-        kind = ("str" if one.choices else kind) + " or unset" * (one.default is None)
+        kind = ("str" if declared.choices else kind) + " or unset" * (declared.default is None)
         # what every integer has to fit into is no range
-        limits = describe_range({k: v for k, v in one.limits.items() if v != _MAX_INTEGER})
+        limits = describe_range({k: v for k, v in declared.limits.items() if v != _MAX_INTEGER})
         value = getattr(options, name)
-        yield OptionInfo(f"{prefix}{name}", value, one.default, kind, one.choices, limits, one.doc)
+        yield OptionInfo(
+            f"{prefix}{name}", value, declared.default, kind, declared.choices, limits, declared.doc
+        )
     for name in _section_names(options):
         yield from iter_options(getattr(options, name), f"{prefix}{name}.")
 

@@ -202,10 +202,12 @@ _QUANTITIES = {
 
 def _describe(of: str, parameters: dict[str, Parameter]) -> Iterator[str]:
     """A sentence for each parameter that is not as recorded."""
-    for name, one in parameters.items():
-        if one.significant:
+    for name, parameter in parameters.items():
+        if parameter.significant:
             what, unit, factor = _QUANTITIES[name]
-            value, std, nominal = (factor * v for v in (one.value, one.std, one.nominal))
+            value, std, nominal = (
+                factor * v for v in (parameter.value, parameter.std, parameter.nominal)
+            )
             yield (
                 f"{of}: {what} is {value:.4g} +- {std:.2g}{unit}, as the motion shows, not "
                 f"{nominal:.4g} as recorded: used"

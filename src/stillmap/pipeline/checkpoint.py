@@ -151,7 +151,7 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
 
 
 def _pack(large: dict[int, NDArray[Any]], value: Any) -> Any:
-    """What MessagePack does not know; large arrays go into `large`, once each."""
+    """Encodes an array, a number of NumPy or an empty grid; large arrays go into `large`."""
     if isinstance(value, em.Grid):  # always empty here
         dimension = 2 if isinstance(value, _core.OccupancyGrid2D) else 3
         return msgpack.Ext(_GRID, msgpack.encode([dimension, value.resolution]))
@@ -165,7 +165,7 @@ def _pack(large: dict[int, NDArray[Any]], value: Any) -> Any:
 
 
 def _unpack(large: list[NDArray[Any]], code: int, packed: memoryview) -> Any:
-    """What `_pack` was given."""
+    """Decodes what `_pack` encoded."""
     content = msgpack.decode(packed)
     if code == _FILE:
         return large[content]

@@ -97,7 +97,7 @@ def _length_warnings(best: Estimate) -> Iterator[str]:
 
 
 def _scan_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
-    """What is odd at some scans, how often, and where first."""
+    """Warnings about scans of doubtful pose: their number, the first of them, the reason."""
     found = best.m_step.diagnostics
     for scans, what, todo in (
         (

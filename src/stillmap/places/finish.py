@@ -303,8 +303,13 @@ def _join_graphs(place: Place) -> PoseGraph:
 def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     """The entries of `sessions.json`, in the order in which the inputs were given."""
     records: dict[str, dict[str, Any]] = {
-        one.name: {"name": one.name, "input": one.input, "accepted": False, "why": one.why}
-        for one in result.refusals
+        refused.name: {
+            "name": refused.name,
+            "input": refused.input,
+            "accepted": False,
+            "why": refused.why,
+        }
+        for refused in result.refusals
     }
     first_scan, by = 0, _to_map_frame(result.place)
     for placed in result.place.sessions:

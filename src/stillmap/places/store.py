@@ -130,7 +130,9 @@ def read_place(folder: Path, threads: int = 1) -> tuple[Place, list[PlaceSession
     if settings.frame not in accepted:
         raise _inconsistent(folder / RECORD)
     sessions = [
-        _read_placed(folder / "sessions" / name, accepted[name], settings.voxel_size, threads)
+        _read_placed_session(
+            folder / "sessions" / name, accepted[name], settings.voxel_size, threads
+        )
         for name in order
     ]
     if len({placed.session.dimension for placed in sessions}) != 1:
@@ -143,7 +145,7 @@ def read_place(folder: Path, threads: int = 1) -> tuple[Place, list[PlaceSession
     return place, refused, [record.name for record in records]
 
 
-def _read_placed(
+def _read_placed_session(
     home: Path, record: PlaceSession, voxel_size: float, threads: int
 ) -> PlacedSession:
     session, state = read_session(home, record.input, threads), home / STATE

@@ -47,11 +47,11 @@ class NearResult(ShortRepr):
         noted = np.zeros(3)
         if (folder / RECORD).is_file():
             noted = ResultFolder(folder, read_run(folder)).read_origin()
-        found = cls(folder, noted if noted.any() else find_origin(poses))
-        if not (np.abs(found.take(poses)) < MAX_DISTANCE).all():
+        near = cls(folder, noted if noted.any() else find_origin(poses))
+        if not (np.abs(near.take(poses)) < MAX_DISTANCE).all():
             where = str(folder / RECORD)
             raise InputError("local_origin is far from its trajectory", where=where)
-        return found
+        return near
 
     @classmethod
     def open_map(cls, folder: Path) -> tuple["NearResult", Grid]:

@@ -135,7 +135,9 @@ def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Ind
     seconds = 1e-9 * (recording.stamp_ns[second] - recording.stamp_ns[first])
     steps = se2.log(se2.inverse(poses[first]) @ poses[second])
     twists = steps / np.where(seconds > 0.0, seconds, np.inf)[:, None]
-    is_leap = _has_leap(poses, first, second) | (np.abs(twists[:, 2]) > MAX_TURN_RATE)
+    is_leap = _has_leap(poses, recording.stamp_ns, first, second) | (
+        np.abs(twists[:, 2]) > MAX_TURN_RATE
+    )
     is_leap |= np.hypot(twists[:, 0], twists[:, 1]) > MAX_SPEED
     twists[is_leap] = 0.0
     vx, vy, turn = _smooth(twists).T
@@ -146,9 +148,9 @@ def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Ind
     return np.stack([c * vx + s * vy, c * vy - s * vx, turn])
 
 
-def _has_leap(poses: Float, first: Index, second: Index) -> Bool:
+def _has_leap(poses: Float, stamp_ns: Int64, first: Index, second: Index) -> Bool:
     """(T,) whether an implausible step lies between two scans."""
-    plausible = motion_model.compute_odometry_steps(poses).plausible
+    plausible = motion_model.compute_odometry_steps(poses, stamp_ns).plausible
     count = np.concatenate([[0], np.cumsum(~plausible)])
     return np.asarray(count[second] > count[first])
 

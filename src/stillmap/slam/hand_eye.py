@@ -101,7 +101,7 @@ def _interpolate(seconds: Float, T: Float, at: Float) -> Float:
     before = np.clip(np.searchsorted(seconds, at, side="right") - 1, 0, len(T) - 2)
     span = np.maximum(seconds[before + 1] - seconds[before], 1e-9)
     share = np.minimum((at - seconds[before]) / span, 1.0)
-    steps = compute_odometry_steps(T)
+    steps = compute_odometry_steps(T, (1e9 * seconds).astype(np.int64))
     share = np.where(steps.plausible[before] | (share == 1.0), share, 0.0)
     return T[before] @ se2.exp(share[:, None] * se2.log(steps.increments[before]))
 

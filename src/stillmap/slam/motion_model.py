@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.core.array_types import Bool, Float
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.slam.options import OdometryOptions
 
 MIN_INCREMENT_STD = 0.02, 0.02  # m, rad: of an increment without motion
@@ -195,16 +195,25 @@ def _unannounced_motion(acceleration: float, seconds: float) -> float:
     return min(max(0.5 * acceleration * seconds**2, _TRANSLATION_FLOOR), _MAX_UNANNOUNCED)
 
 
-def compute_odometry_steps(T_odom_base: Float) -> OdometrySteps:
-    """The steps between poses (T, 3, 3)."""
+def compute_odometry_steps(T_odom_base: Float, stamp_ns: Int64) -> OdometrySteps:
+    """The steps between poses (T, 3, 3) with stamps (T,); a leap is too fast for the robot."""
     increments = se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]
     metres = np.linalg.norm(increments[:, :2, 2], axis=1)
-    usual = float(np.quantile(metres, 0.95)) if len(metres) else 0.0
-    return OdometrySteps(increments, metres <= max(_MIN_LEAP, _LEAP_RATIO * usual))
+    if not len(metres):
+        return OdometrySteps(increments, np.ones(0, np.bool_))
+    seconds = 1e-9 * np.diff(stamp_ns)
+    seconds = np.maximum(seconds, max(float(np.median(seconds)), 1e-9))
+    usual = float(np.quantile(metres / seconds, 0.95))
+    limit = np.maximum(_MIN_LEAP, _LEAP_RATIO * usual * seconds)
+    return OdometrySteps(increments, metres <= limit)
 
 
 def odometry_std(distance: Any, turn: Any, options: OdometryOptions) -> tuple[Any, Any]:
-    """Standard deviations in m and rad of increments of `distance` m and `turn` rad."""
+    """Standard deviations in m and rad of increments of `distance` m and `turn` rad.
+
+    Errors of successive metres and radians are independent: over n they grow with the root of n.
+    """
+    distance, turn = (np.minimum(value, np.sqrt(value)) for value in (distance, turn))
     translation = (
         _TRANSLATION_FLOOR
         + options.translation_per_metre * distance

@@ -86,7 +86,11 @@ class _ScanOdometry:
         self.drift, self.unmeasured = np.zeros((T, 3, 3)), np.zeros(T)
         self.widened, self.odometry_faults = np.zeros((2, T), np.bool_)
         self.breaks = list[int]()
-        self.steps = None if odometry is None else motion_model.compute_odometry_steps(odometry)
+        self.steps = (
+            None
+            if odometry is None
+            else motion_model.compute_odometry_steps(odometry, recording.stamp_ns)
+        )
         self.slip = SlipDetector(None if self.steps is None else self.steps.increments)
         self.noise = VelocityNoise()
         self.odometry_noise = motion_model.OdometryNoise()

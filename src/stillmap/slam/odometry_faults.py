@@ -190,7 +190,7 @@ def replace_stretches(
     Returns:
         (T, 3, 3) poses; None where there is no such stretch.
     """
-    measured = motion_model.compute_odometry_steps(T_odom_base)
+    measured = motion_model.compute_odometry_steps(T_odom_base, stamp_ns)
     motion = se2.inverse(poses[:-1]) @ poses[1:]
     differs = find_differences(motion, measured.increments, stamp_ns, options)
     by_odometry = _exclude_known_faults(differs, measured.plausible, diagnostics)

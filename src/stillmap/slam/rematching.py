@@ -142,7 +142,7 @@ def _match_scans(window: Recording, e: Float32, options: SlamOptions) -> Float:
     Without the wide searches of `register_scans`: given poses that jump disagree with these anyway.
     """
     assert window.T_odom_base is not None
-    increments = compute_odometry_steps(window.T_odom_base).increments
+    increments = compute_odometry_steps(window.T_odom_base, window.stamp_ns).increments
     grid = _core.OccupancyGrid2D(options.resolution, FREE_SPACE_MARGIN)
     local_map = LocalMap(grid, window, e)
     found = np.tile(np.eye(3), (window.n_scans, 1, 1))

@@ -75,7 +75,7 @@ def select_segments(recording: Recording, sensor: int, windows: int) -> list[Ind
         return []
     interval = 1e-9 * float(np.median(np.diff(recording.stamp_ns[scans])))
     scans = scans[:: max(1, round(_MIN_INTERVAL / max(interval, 1e-3)))]
-    steps = compute_odometry_steps(recording.T_odom_base[scans])
+    steps = compute_odometry_steps(recording.T_odom_base[scans], recording.stamp_ns[scans])
     x, y, turn = np.abs(se2.parameters(steps.increments)).T
     travel = np.hypot(x, y)
     seconds = 1e-9 * np.diff(recording.stamp_ns[scans])

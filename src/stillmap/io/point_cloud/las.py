@@ -98,7 +98,7 @@ def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
 
 
 def _check_header(file: InputFile, path: Path) -> int | None:
-    """Where the table of chunks of a compressed file begins; None: it is not compressed.
+    """Position of the chunk table of a compressed file, in bytes; None: not compressed.
 
     Raises:
         InputError: the libraries would run out of time or memory, or lazrs is missing.

@@ -211,7 +211,7 @@ class Bag:
 def read_bag(
     paths: Sequence[Path], scratch: Path | None, use: Callable[[Bag], T], more: Sequence[Path] = ()
 ) -> tuple[T, str]:
-    """What `use` makes of a bag, with its index, else of what can be recovered; and its damage.
+    """Calls `use` on a bag, opened by its index or else by recovery; its result and the damage.
 
     Args:
         paths, scratch: see Bag.

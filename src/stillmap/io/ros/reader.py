@@ -207,7 +207,7 @@ class BagContent:
         self._count[topic] += use == "scans"
         try:
             content = decode(message)
-            if self._is_selected(message, content, use):
+            if self._is_inside_window(message, content, use):
                 fault = self._collect(message, content, use)
         except OSError:  # the disk is full
             raise
@@ -218,7 +218,7 @@ class BagContent:
         elif fault is not None:
             self.unreadable.add(f"{fault} ({topic})", number)
 
-    def _is_selected(self, message: Message, content: Any, use: str | None) -> bool:
+    def _is_inside_window(self, message: Message, content: Any, use: str | None) -> bool:
         # one CameraInfo holds for all images
         if use not in ("scans", "images") or message.channel.type == CAMERA_INFO:
             return True

@@ -115,15 +115,17 @@ def _write_points(
         low = np.minimum(low, block.points.min(axis=0))
         high = np.maximum(high, block.points.max(axis=0))
         colors = () if block.colors is None else block.colors.T
-        for one, column in zip(values, [*block.points.T, block.p_static, *colors], strict=True):
-            one[: len(column)] = column
-            digest.update(one[: len(column)].data)
+        for values_of, column in zip(
+            values, [*block.points.T, block.p_static, *colors], strict=True
+        ):
+            values_of[: len(column)] = column
+            digest.update(values_of[: len(column)].data)
         writer.write(len(block.points))
     return digest.hexdigest(), low, high
 
 
 def _describe_scan(cloud: Cloud) -> dict[str, Any]:
-    """What a scan says of its points."""
+    """Header entries of a scan: name, description, limits of intensity and colour, bounds."""
     text = "intensity is the probability that the point is static"
     scan: dict[str, Any] = {
         "name": "points in the map frame",
