@@ -213,10 +213,7 @@ def odometry_std(distance: Any, turn: Any, options: OdometryOptions) -> tuple[An
 
     Errors of successive metres and radians are independent: over n they grow with the root of n.
     """
-    if isinstance(distance, float):  # of one scan: NumPy takes ten times as long
-        distance, turn = min(distance, math.sqrt(distance)), min(turn, math.sqrt(turn))
-    else:
-        distance, turn = np.minimum(distance, np.sqrt(distance)), np.minimum(turn, np.sqrt(turn))
+    distance, turn = (np.minimum(value, np.sqrt(value)) for value in (distance, turn))
     translation = (
         _TRANSLATION_FLOOR
         + options.translation_per_metre * distance
