@@ -54,9 +54,16 @@ def test_mean_and_standard_deviations_by_hand():
     increment = se2.matrix(0.3, 0.4, -0.4)
     prior = motion_model.odometry_prior(T0, increment, options)
     np.testing.assert_allclose(prior.T_map_base, T0 @ increment, atol=1e-14)
-    assert prior.translation_std == pytest.approx(0.24)
     assert prior.rotation_std == pytest.approx(0.27)
-    np.testing.assert_allclose(prior.information, np.diag([0.24**-2, 0.24**-2, 0.27**-2]))
+    # a heading that errs as a random walk leads aside: 0.5 m * 0.27 rad / sqrt(3)
+    assert prior.translation_std == pytest.approx(np.hypot(0.24, 0.5 * 0.27 / np.sqrt(3.0)))
+    covariance = np.linalg.inv(prior.information)
+    way = prior.T_map_base[:2, 2] - T0[:2, 2]
+    along, across = way / 0.5, np.array([-way[1], way[0]]) / 0.5
+    assert along @ covariance[:2, :2] @ along == pytest.approx(0.24**2)
+    assert across @ covariance[:2, :2] @ across == pytest.approx(prior.translation_std**2)
+    np.testing.assert_allclose(covariance[:2, 2], 0.5 * 0.27**2 * 0.5 * across, atol=1e-12)
+    assert covariance[2, 2] == pytest.approx(0.27**2)
 
 
 def test_errors_of_many_metres_add_up_as_a_random_walk():

@@ -29,6 +29,7 @@ _INFLATION = 2.2
 _NOISE_RATE, _MIN_NOISE_SHARE, _MIN_GAIN, _MAX_INNOVATION = 0.05, 0.1, 0.1, 3.0
 # s after which a velocity that no scan corrected says nothing any more
 _VELOCITY_TIME = 5.0
+_UNIFORM_ROTATION = math.pi / math.sqrt(3.0)  # rad, std of a heading of which nothing is known
 _MAX_UNANNOUNCED = 0.15  # m and rad, upper limit of the motion that these explain
 
 
@@ -243,11 +244,20 @@ def odometry_prior(
 ) -> MotionPrior:
     """The prior after an odometry increment (3, 3) from a pose (3, 3)."""
     x, y, theta = se2.parameters(increment).tolist()
-    std = odometry_std(math.hypot(x, y), abs(theta), options)
+    metres = math.hypot(x, y)
+    std = odometry_std(metres, abs(theta), options)
     translation, rotation = (
-        one * share for one, share in zip(std, noise.inflated_shares(), strict=True)
+        float(one * share) for one, share in zip(std, noise.inflated_shares(), strict=True)
     )
-    return gaussian_prior(T_map_base @ increment, translation, rotation, is_odometry=True)
+    rotation = min(rotation, _UNIFORM_ROTATION)
+    mean = se2.normalize(T_map_base @ increment)
+    # the heading errs as a random walk along the way, which leads the robot aside
+    across = np.array([T_map_base[1, 2] - mean[1, 2], mean[0, 2] - T_map_base[0, 2]])
+    covariance = np.diag([translation**2, translation**2, rotation**2])
+    covariance[:2, :2] += rotation**2 / 3.0 * np.outer(across, across)
+    covariance[:2, 2] = covariance[2, :2] = 0.5 * rotation**2 * across
+    translation = math.hypot(translation, metres * rotation / math.sqrt(3.0))
+    return MotionPrior(mean, np.linalg.inv(covariance), translation, rotation, is_odometry=True)
 
 
 def constant_velocity_prior(

@@ -1,11 +1,8 @@
 """Incremental scan matching in 2D: each scan is matched (9), then added to the local map (10)."""
 
-import functools
-
 import numpy as np
 
 import stillmap._core as _core
-from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, relocalization
@@ -16,9 +13,6 @@ from stillmap.slam.options import SlamOptions
 from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, Scan, select_hits
 from stillmap.slam.scan_matching import (
-    FAULT_GAIN,
-    MIN_GAIN,
-    ODOMETRY_FAULT,
     ScanMatch,
     accept_prior,
     is_inconsistent,
@@ -29,9 +23,7 @@ from stillmap.slam.scan_matching import (
 from stillmap.slam.types import BareStretch, Diagnostics, MStepResult, ScanProgress
 
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-_MAX_SPEED, _MAX_TURN_RATE, _MIN_REACH = 3.0, 4.0, 0.5  # m/s, rad/s of robots; m and rad
 _SURE_GAIN = 40.0  # nats of a pose outside the prior, from which one scan is enough
-_MAX_LATE_SCANS = 4  # after which odometry is not late, but at fault
 # featureless stretches: m, from which a step is hardly measured; scans that are measured within one
 # of them; m, std of the length from which one is named
 _MIN_STEP_STD, _MAX_GAP, _MIN_STD = 0.04, 10, 0.3
@@ -97,7 +89,7 @@ class _ScanOdometry:
         self.seconds_before = np.append(0.0, 1e-9 * np.diff(recording.stamp_ns))
         self.seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
         self.travelled = 0.0
-        self.compared_until, self.before_fault = 0, -_MAX_LATE_SCANS - 1
+        self.compared_until = 0
         # running average of the explained share, per sensor: each sees its own side
         self.usual = np.zeros(len(recording.T_base_sensor))
         self.usual[recording.sensor[0]] = 1.0
@@ -120,9 +112,7 @@ class _ScanOdometry:
         if slip is not None:
             match = self._accept_slip(t, slip)
             guess = self._predict(t)
-        rejected = None if prior.is_odometry else other
-        is_fault = rejected is not None and is_inconsistent(rejected, match.T_map_base)
-        self._record(t, match, is_fault=is_fault)
+        self._record(t, match, is_fault=self._rejects_odometry(t, prior, other, match))
         self.drift[t] = motion_model.blind_drift(learned or prior, match.covariance)
         self.unmeasured[t] = motion_model.unmeasured_variance(
             learned or prior, match.covariance, float(self.seconds_before[t])
@@ -169,6 +159,14 @@ class _ScanOdometry:
         is_valid = self.steps.plausible[t - 1] and not is_slipping
         return (measured, guess) if is_valid else (guess, measured)
 
+    def _rejects_odometry(
+        self, t: int, prior: MotionPrior, other: MotionPrior | None, match: ScanMatch
+    ) -> bool:
+        """True if odometry was not the prior of scan t, and leaps or contradicts its match."""
+        if self.steps is None or prior.is_odometry or other is None:
+            return False
+        return not self.steps.plausible[t - 1] or is_inconsistent(other, match.T_map_base)
+
     def _accept_slip(self, t: int, slip: SlipHypothesis) -> ScanMatch:
         """Replaces the poses since odometry stopped; returns the match of scan t."""
         # the scans are not added again: those to come show the same
@@ -189,20 +187,13 @@ class _ScanOdometry:
         if len(scan.points) == 0 or usual == 0.0:
             return match, False
         if is_poor(match, usual):
-            match = self._match_late_odometry(t, scan, match, usual)
-        if is_poor(match, usual):
             # one scan that fits somewhere near tells no fault of odometry from a robot carried
             # away while nothing was recorded: all that follow decide
             if relocalization.is_gap(float(self.seconds_before[t]), self.seconds):
                 return self._start_segment(t, prior), False
-            # odometry that stands still may have stalled
-            min_gain = ODOMETRY_FAULT if self.slip.has_stopped(t) else FAULT_GAIN
-            wider = widen_match(grid, scan, prior, other, match, usual, min_gain)
+            wider = widen_match(grid, scan, prior, other, match, usual)
             is_sure = match.cost - wider.cost > _SURE_GAIN
-            if wider.widened and not self._is_reachable(t, wider):
-                return self._start_segment(t, prior), False
             if wider.widened and (is_sure or self._is_consistent_ahead(t, wider, usual)):
-                self.before_fault = t - 1
                 return wider, False
         if not is_poor(match, usual):
             return match, False
@@ -215,19 +206,6 @@ class _ScanOdometry:
             return match, contradicts
         return self._start_segment(t, prior), False
 
-    def _match_late_odometry(self, t: int, scan: Scan, match: ScanMatch, usual: float) -> ScanMatch:
-        """The match by odometry since before the last fault, if that is better.
-
-        Odometry that comes late is wrong at one scan and right again at the next.
-        """
-        if self.steps is None or t - self.before_fault > _MAX_LATE_SCANS:
-            return match
-        first = self.before_fault
-        increment = functools.reduce(np.matmul, self.steps.increments[first:t])
-        prior = motion_model.odometry_prior(self.poses[first], increment, self.options.odometry)
-        late = match_scan(self.local_map.grid, scan, prior, usual)
-        return late if late.cost < match.cost - MIN_GAIN else match
-
     def _start_segment(self, t: int, prior: MotionPrior) -> ScanMatch:
         """Starts a new local map where the prior leads: loop closure decides where it belongs."""
         self.breaks.append(t)
@@ -235,13 +213,6 @@ class _ScanOdometry:
         self.local_map.clear()
         self.slip.reset()
         return accept_prior(prior)
-
-    def _is_reachable(self, t: int, match: ScanMatch) -> bool:
-        """True if a robot can move to a match since the scan before."""
-        x, y, theta = se2.parameters(se2.inverse(self.poses[t - 1]) @ match.T_map_base)
-        seconds = self.seconds_before[t]
-        metres, radians = (max(_MIN_REACH, rate * seconds) for rate in (_MAX_SPEED, _MAX_TURN_RATE))
-        return bool(np.hypot(x, y) <= metres and abs(theta) <= radians)
 
     def _is_consistent_ahead(self, t: int, match: ScanMatch, usual: float) -> bool:
         """True if the scans after t do not contradict the map if the robot goes on from a match."""

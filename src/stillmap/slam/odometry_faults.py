@@ -148,10 +148,6 @@ class SlipDetector:
         step = _step_size(se2.inverse(last) @ T_map_base)
         return step > _MIN_STEP and self._odometry_step(t) < _STILL_RATIO * step
 
-    def has_stopped(self, t: int) -> bool:
-        """True if odometry stands still on the way to scan t."""
-        return self._odometry_step(t) < _STILL_RATIO * _MIN_STEP
-
     def _odometry_step(self, t: int) -> float:
         """Size of the odometry step to scan t."""
         return np.inf if self._increments is None else _step_size(self._increments[t - 1])

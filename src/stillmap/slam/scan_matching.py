@@ -5,6 +5,8 @@ Likelihood field around end points, correlative search, Newton refinement; what 
 """
 
 import dataclasses
+import itertools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,11 +29,15 @@ _SEARCH_STDS = 3.0  # half width of the search window in standard deviations of 
 # of the usual explained share: enough for the optimum next to odometry; too little without a wider
 # search
 _LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
-_WIDE_TRANSLATION, _WIDE_ROTATION = 0.5, 0.5  # m, rad: min half width of the wider search
-_LOST_TRANSLATION = 1.5  # m, half width of the last search, over all headings
-# nats that a pose must gain outside the learned noise, and outside that of the options
-MIN_GAIN, FAULT_GAIN = 7.0, 15.0
+# m, rad: half widths of the wider searches, at least
+_WIDE_WINDOWS = (0.5, 0.5), (1.5, math.pi)
+MIN_GAIN = 7.0  # nats that a pose must gain outside the learned noise of odometry
+_FAULT_COST = -math.log(1e-3)  # nats: prior probability of a fault of odometry at a scan
 ODOMETRY_FAULT = 10.0  # nats of gain from which odometry is rejected
+# nats that new parts of the world cost at most where odometry leads: a robot that moves on sees
+# them, and buildings repeat, so that a place that is known and alike proves little
+_MAX_UNKNOWN_COST = 14.0
+_OCCLUDED_COST = 1.5  # of a beam that passes through a wall, as its end point may not show
 _INCONSISTENT_STDS = 3.0  # standard deviations from a prior's mean: it no longer holds
 MAX_OCCLUDED = 0.2  # share of a scan's beams that may seem to pass through walls
 # a wall: occupancy, m before the end of the beam
@@ -46,7 +52,8 @@ class ScanMatch:
         T_map_base: (3, 3).
         covariance: (3, 3) of x, y (map frame) and heading: inverse curvature of the cost.
         explained: weighted share of the beams that the map explains, in [0, 1].
-        cost: nats, of the beams without the prior.
+        cost: nats, of the beams without the prior, those through walls included; with a prior of
+            odometry, of end points in unknown space no more than `_MAX_UNKNOWN_COST`.
         alternatives: (R, 4) optima of the other candidates: x, y, heading from the pose, and their
             additional cost in nats.
         widened: found only by a wider search than the prior's window.
@@ -98,9 +105,8 @@ def widen_match(
     other: MotionPrior | None,
     match: ScanMatch,
     usual: float,
-    min_gain: float = FAULT_GAIN,
 ) -> ScanMatch:
-    """A pose outside the prior that fits a scan much better, or the same match.
+    """A pose outside the prior that is more likely although odometry rarely fails, or the match.
 
     Args:
         grid: the map so far.
@@ -109,13 +115,19 @@ def widen_match(
         other: a second prior.
         match: a poor match within the prior.
         usual: recent average of the explained share.
-        min_gain: nats by which that pose must fit better.
     """
     threshold = _WIDEN_BELOW * usual
-    windows = [(_WIDE_TRANSLATION, _WIDE_ROTATION), (_LOST_TRANSLATION, np.pi)]
-    for mean in (prior, other):
-        if mean is not None and match.explained < threshold:
-            match = _widen_search(grid, scan, mean, match, min_gain, threshold, windows)
+    cost = _evidence_cost(prior, match)
+    for mean, window in itertools.product((prior, other), _WIDE_WINDOWS):
+        if mean is None or match.explained >= threshold:
+            continue
+        wide = motion_model.widen_prior(mean, *(half / _SEARCH_STDS for half in window))
+        wider = _search_window(grid, scan, wide)
+        cost_of_fault = _evidence_cost(wide, wider) + _FAULT_COST
+        # at a place that only looks alike, beams would pass through walls
+        is_alike = occluded_share(grid, scan, wider.T_map_base) > MAX_OCCLUDED
+        if cost_of_fault < cost and not is_alike:
+            match, cost = dataclasses.replace(wider, widened=True), cost_of_fault
     return _loosen_prior(grid, scan, prior, match)
 
 
@@ -144,38 +156,29 @@ def _match_within_prior(
     grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, usual: float
 ) -> ScanMatch:
     """The best pose within the prior's window; the optimum next to odometry if good enough."""
-    if prior.is_odometry:
-        local = refine_pose(grid, scan, prior, prior.T_map_base)
-        if local.explained >= _LOCAL_SHARE * usual:
-            return local
-    translation = _SEARCH_STDS * prior.translation_std
-    rotation = _SEARCH_STDS * prior.rotation_std
-    return search_pose(grid, scan, prior, translation, rotation)
+    if not prior.is_odometry:
+        return _search_window(grid, scan, prior)
+    local = refine_pose(grid, scan, prior, prior.T_map_base)
+    if local.explained >= _LOCAL_SHARE * usual:
+        return local
+    matches = local, _search_window(grid, scan, prior)
+    return min(matches, key=lambda match: _evidence_cost(prior, match))
 
 
-def _widen_search(
-    grid: _core.OccupancyGrid2D,
-    scan: Scan,
-    prior: MotionPrior,
-    match: ScanMatch,
-    min_gain: float,
-    threshold: float,
-    windows: list[tuple[float, float]],
-) -> ScanMatch:
-    """Replaces a match by one outside the prior's window that fits much better.
+def _search_window(grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior) -> ScanMatch:
+    """The best pose in the window of a prior."""
+    stds = prior.translation_std, prior.rotation_std
+    return search_pose(grid, scan, prior, *(_SEARCH_STDS * std for std in stds))
 
-    At a place that only looks alike, beams would pass through walls.
+
+def _evidence_cost(prior: MotionPrior, match: ScanMatch) -> float:
+    """Nats, -ln of the probability of a scan given a prior of its motion.
+
+    Laplace's approximation of the integral over poses, in which the width of the prior counts:
+    cost + 1/2 ln(det prior covariance / det posterior covariance).
     """
-    for translation, rotation in windows:
-        wide = motion_model.widen_prior(prior, translation / 3.0, rotation / 3.0)
-        window = _SEARCH_STDS * wide.translation_std, _SEARCH_STDS * wide.rotation_std
-        wider = search_pose(grid, scan, wide, *window)
-        fits = wider.cost < match.cost - min_gain
-        if fits and occluded_share(grid, scan, wider.T_map_base) <= MAX_OCCLUDED:
-            match = dataclasses.replace(wider, widened=True)
-        if match.explained >= threshold:
-            break
-    return match
+    volume = np.linalg.slogdet(match.covariance)[1] + np.linalg.slogdet(prior.information)[1]
+    return match.cost + prior.cost(match.T_map_base) - 0.5 * float(volume)
 
 
 def _distance(prior: MotionPrior, T_map_base: Float) -> tuple[float, float]:
@@ -221,7 +224,26 @@ def _register(
         isotropy=scan.isotropy,
         **search,
     )
-    return ScanMatch(T, covariance, explained, cost - prior.cost(T), alternatives)
+    cost += _ray_cost(grid, scan, T) - prior.cost(T)
+    if prior.is_odometry:
+        cost -= _excess_of_unknown(grid, scan, T)
+    return ScanMatch(T, covariance, explained, cost, alternatives)
+
+
+def _ray_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
+    """Nats of the beams that would pass through walls at a pose (3, 3)."""
+    occluded = occluded_share(grid, scan, T_map_base) * float(scan.weights.sum(dtype=np.float64))
+    return _INFORMATION_SCALE * _OCCLUDED_COST * occluded
+
+
+def _excess_of_unknown(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
+    """Nats by which end points in unknown space cost more at a pose (3, 3) than they do at most."""
+    ends = scan_hits.transform_points(scan.points, T_map_base)
+    cells = np.floor(ends / grid.resolution).astype(np.int64)
+    is_unknown = grid.alpha_beta(cells).sum(axis=1) <= 0.0
+    per_beam = -_INFORMATION_SCALE * math.log((_FLOOR + _UNKNOWN) / (_FLOOR + 1.0))
+    weight = float(scan.weights[is_unknown].sum(dtype=np.float64))
+    return max(per_beam * weight - _MAX_UNKNOWN_COST, 0.0)
 
 
 def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
