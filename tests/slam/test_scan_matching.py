@@ -96,6 +96,19 @@ def test_unknown_place_keeps_odometry(hall, mapped, scan):
     assert not found.widened
 
 
+def test_a_new_place_that_looks_like_a_known_one_is_no_reason_to_leave_odometry(room, mapped, scan):
+    # next door: seven beams of ten end as they do in the room that is mapped
+    points, rng = scan(room, (0, 0, 0)), np.random.default_rng(3)
+    is_other = rng.random(len(points)) < 0.3
+    points[is_other] *= rng.uniform(0.5, 0.8, (is_other.sum(), 1)).astype(np.float32)
+    next_door = (14.0, 0.0, 0.0)
+    prior = dataclasses.replace(prior_at(next_door, 4.2, 0.05), is_odometry=True)
+    assert_at(placed(mapped(room), points, ones(points), prior), next_door)
+    # where odometry leads into that room, it is the room
+    home = dataclasses.replace(prior_at((0.3, 0.2, 0.02), 0.3, 0.05), is_odometry=True)
+    assert_at(placed(mapped(room), points, ones(points), home), (0, 0, 0))
+
+
 def test_zero_weight_equals_absence(hall, mapped, scan):
     grid, truth = mapped(hall), np.array([0.2, 0.1, 0.3])
     points = scan(hall, truth)
