@@ -40,8 +40,8 @@ _MAX_UNKNOWN_COST = 14.0
 _OCCLUDED_COST = 1.5  # of a beam that passes through a wall, as its end point may not show
 _INCONSISTENT_STDS = 3.0  # standard deviations from a prior's mean: it no longer holds
 MAX_OCCLUDED = 0.2  # share of a scan's beams that may seem to pass through walls
-# a wall: occupancy, m before the end of the beam
-WALL_OCCUPANCY, _WALL_MARGIN = 0.4, 0.5
+# a wall: occupancy, m before the end of the beam; and of a beam that ends behind it
+WALL_OCCUPANCY, _WALL_MARGIN, _NEAR_WALL = 0.4, 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -237,13 +237,19 @@ def _ray_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> flo
 
 
 def _excess_of_unknown(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
-    """Nats by which end points in unknown space cost more at a pose (3, 3) than they do at most."""
+    """Nats by which new end points cost more at a pose (3, 3) than they do at most.
+
+    What is unknown behind a wall is not new.
+    """
     ends = scan_hits.transform_points(scan.points, T_map_base)
     cells = np.floor(ends / grid.resolution).astype(np.int64)
     is_unknown = grid.alpha_beta(cells).sum(axis=1) <= 0.0
+    points, weights = scan.points[is_unknown], scan.weights[is_unknown]
+    unknown = dataclasses.replace(scan, points=points, weights=weights)
+    hidden = occluded_share(grid, unknown, T_map_base, _NEAR_WALL)
     per_beam = -_INFORMATION_SCALE * math.log((_FLOOR + _UNKNOWN) / (_FLOOR + 1.0))
-    weight = float(scan.weights[is_unknown].sum(dtype=np.float64))
-    return max(per_beam * weight - _MAX_UNKNOWN_COST, 0.0)
+    new = (1.0 - hidden) * float(weights.sum(dtype=np.float64))
+    return max(per_beam * new - _MAX_UNKNOWN_COST, 0.0)
 
 
 def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
@@ -270,14 +276,19 @@ def _likelihood_field(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
     return {"sigma": _FIELD_STD, "radius": radius, "floor": _FLOOR, "unknown": _UNKNOWN}
 
 
-def occluded_share(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
-    """Share of the beams that would pass through walls of the map at a pose (3, 3)."""
+def occluded_share(
+    grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float, margin: float = _WALL_MARGIN
+) -> float:
+    """Share of the beams that would pass through walls of the map at a pose (3, 3).
+
+    Walls less than `margin` m before the end of a beam do not count.
+    """
     return _core.occluded_share(
         grid,
         scan.points,
         scan.weights,
         T_map_base,
         scan.T_base_sensor,
-        margin=_WALL_MARGIN,
+        margin=margin,
         min_occupancy=WALL_OCCUPANCY,
     )
