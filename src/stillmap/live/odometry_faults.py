@@ -24,6 +24,7 @@ from stillmap.slam.scan_matching import (
     is_poor,
     occluded_share,
     refine_pose,
+    registration_cost,
     search_pose,
 )
 
@@ -101,7 +102,12 @@ class StandingTest:
         standing, moving = (
             refine_pose(grid, every, gaussian_prior(pose, *_STD), pose) for pose in (self._pose, T)
         )
-        self._gain, self._scans = self._gain + moving.cost - standing.cost, self._scans + 1
+        # by end points alone: the local map is smeared along a motion that was none, and beams of
+        # a robot that stands seem to pass through it
+        stands, moves = (
+            registration_cost(grid, every, match.T_map_base) for match in (standing, moving)
+        )
+        self._gain, self._scans = self._gain + moves - stands, self._scans + 1
         if self._gain < _REJECTED:
             self.reset()
             return None
