@@ -15,7 +15,7 @@ from stillmap.live.replay import iter_beams
 from stillmap.results.eval.trajectory import align
 from stillmap.sim import scene_by_name, simulate
 
-BEFORE, ELSEWHERE, AGAIN = 120, 190, 250  # scans, until it is carried on
+BEFORE, ELSEWHERE, AGAIN = 120, 170, 230  # scans, until it is carried on
 
 
 @pytest.fixture(scope="module")

@@ -254,8 +254,7 @@ class ScanOdometry:
             return match, match.contradicts_odometry
         guess = self._guess() if prior.is_odometry else None
         wider = widen_match(grid, scan, prior, guess, match, usual)
-        # after a scan that contradicted the map, a poor one is where a place only looks alike
-        is_sure = not (self._contradictions and is_poor(wider, usual))
+        is_sure = not is_poor(wider, usual)  # a poor one is where a place only looks alike
         step = se2.inverse(self._pose) @ wider.T_map_base
         if wider.widened and is_sure and is_plausible(step, self._seconds_to(beams)):
             return wider, prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
