@@ -121,10 +121,11 @@ class OdometryNoise:
 
     def update(self, prior: MotionPrior, T_map_base: Float, covariance: Float) -> "OdometryNoise":
         """After a scan with that prior and posterior: pose (3, 3), covariance (3, 3)."""
-        std = np.array([prior.translation_std, prior.translation_std, prior.rotation_std])
-        left, vectors = np.linalg.eigh(covariance / (std[:, None] * std))  # 1 - gain
+        # of the translation without what the error of the heading adds to it, and of the heading
+        whiten = np.linalg.cholesky(prior.information).T
+        left, vectors = np.linalg.eigh(whiten @ covariance @ whiten.T)  # 1 - gain
         gain = (1.0 - left).clip(0.0)
-        residual = vectors.T @ (prior.residual(T_map_base) / std)
+        residual = vectors.T @ (whiten @ prior.residual(T_map_base))
         innovation = np.abs(residual / gain.clip(_MIN_GAIN)).clip(max=_MAX_INNOVATION)
         excess = (vectors**2 * gain) @ (np.square(_INFLATION * innovation) - 1.0)
         return OdometryNoise(
