@@ -110,12 +110,13 @@ def test_straight_travel_has_no_loops():
     assert mapped(short).loops == []
 
 
-def straight_context():
-    """Twice along the same 20 m, keyframes a metre apart."""
-    x = np.concatenate([np.arange(21.0), np.arange(21.0)])
+def straight_context(spacing=1.0):
+    """Twice along the same way, 21 keyframes each."""
+    x = spacing * np.concatenate([np.arange(21.0), np.arange(21.0)])
     recording = dataclasses.replace(square().recording, T_odom_base=None)
     n = len(x)
-    return loop_context(recording, se2.matrix(x, 0.0, 0.0), np.arange(float(n)), np.arange(n))
+    travelled = spacing * np.arange(float(n))
+    return loop_context(recording, se2.matrix(x, 0.0, 0.0), travelled, np.arange(n))
 
 
 def closures(shifts):
@@ -127,8 +128,9 @@ def closures(shifts):
     ]
 
 
-def test_inconsistent_closure_is_rejected():
-    context = straight_context()
+@pytest.mark.parametrize("spacing", [1.0, 5.0])
+def test_inconsistent_closure_is_rejected(spacing):
+    context = straight_context(spacing)
     chain = odometry_constraints(context, OPTIONS.odometry, [])
     shifts = [0.5] * 8
     shifts[4] = -0.5
@@ -136,6 +138,15 @@ def test_inconsistent_closure_is_rejected():
     assert rejected == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
     (single,) = reject_inconsistent(context, chain, closures([0.1]))
     assert single.rejected
+
+
+def test_closures_agree_with_none_beyond_a_break():
+    context = straight_context()
+    chain = odometry_constraints(context, OPTIONS.odometry, [25])
+    rejected = [c.rejected for c in reject_inconsistent(context, chain, closures([0.5] * 8))]
+    assert not any(rejected)
+    rejected = [c.rejected for c in reject_inconsistent(context, chain, closures([0.5] * 5))]
+    assert [bool(reason) for reason in rejected] == [False] * 4 + [True]
 
 
 def test_leap_from_odometry_widens_the_constraint():

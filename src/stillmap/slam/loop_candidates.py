@@ -22,7 +22,7 @@ _MIN_STAGE, _STAGE_SHARE = 40.0, 0.05
 _DRIFT_TRANSLATION, DRIFT_ROTATION = 0.006, 0.0003
 _MIN_DRIFT, _MAX_DRIFT_TRAVEL = (0.1, 0.02), 1000.0
 _STEP_TRANSLATION, _STEP_ROTATION = 0.03, 0.004  # random walk, m and rad per root of a metre
-_NO_ODOMETRY = [1e3, 1e3, 10.0]  # m, m, rad: std of a step across a break
+NO_ODOMETRY = [1e3, 1e3, 10.0]  # m, m, rad: std of a step across a break
 _LEAP_STDS = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
 
 
@@ -180,7 +180,7 @@ def odometry_constraints(
         back = se2.inverse(poses[j])
         covariance += se2.rotate_covariance(context.drift[i + 1 : j + 1].sum(axis=0), back)
         if j in breaks:
-            covariance = np.diag(np.square(_NO_ODOMETRY))
+            covariance = np.diag(np.square(NO_ODOMETRY))
         chain.append(Constraint(k, k + 1, T, covariance))
     return chain
 

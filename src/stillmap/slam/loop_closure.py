@@ -209,9 +209,9 @@ def _to_constraint(keyframes: Index, closure: LoopClosure) -> Constraint:
     return Constraint(int(first), int(second), closure.T, closure.covariance)
 
 
-# keyframe distances on the earlier and the later side that count as nearby, closures nearby that
-# must agree, chi-square up to which two agree
-_NEARBY = np.array([8.0, 4.0])
+# keyframes on the earlier and the later side that count as nearby, closures nearby that must agree,
+# chi-square up to which two agree
+_NEARBY = np.array([8, 4])
 _MIN_AGREEING, _MAX_AGREEMENT_CHI2 = 2, 9.0
 
 
@@ -223,12 +223,10 @@ def reject_inconsistent(
     At least `_MIN_AGREEING` closures nearby and half of them all must agree.
     """
     accepted = _AcceptedLoops(context, chain, closures)
-    at, nearby = context.travelled[accepted.scans], _NEARBY * context.keyframe_distance
     out, n = [], 0
     for closure in closures:
         if not closure.rejected:
-            others = np.flatnonzero((np.abs(at - at[n]) < nearby).all(axis=1))
-            others = others[others != n]
+            others = accepted.nearby(n)
             n_agreeing = np.count_nonzero(accepted.agree(n, others))
             if n_agreeing < max(_MIN_AGREEING, len(others) / 2):
                 closure = closure.reject("nearby closures disagree")
@@ -252,11 +250,9 @@ def reject_inconsistent_since(
         decided: the result of those before keyframe k.
         k: index into the keyframes.
     """
-    later = [context.travelled[closure.later] for closure in attempted]
-    near = _NEARBY[1] * context.keyframe_distance
+    later = np.searchsorted(context.keyframes, [closure.later for closure in attempted])
     # new votes reach back one neighborhood, whose closures depend on one more
-    here = context.travelled[context.keyframes[k]]
-    changed, relevant = np.searchsorted(later, here - [near, 2 * near])
+    changed, relevant = np.searchsorted(later, [k - _NEARBY[1], k - 2 * _NEARBY[1]])
     again = reject_inconsistent(context, chain, attempted[relevant:])
     return decided[:changed] + again[changed - relevant :]
 
@@ -265,11 +261,11 @@ class _AcceptedLoops:
     """Loop closures that are not rejected, as arrays.
 
     Attributes:
-        scans: (L, 2) earlier and later scan.
+        scans, keyframes: (L, 2) earlier and later scan, and their keyframes' indices.
         T: (L, 3, 3) as of LoopClosure.
         P_earlier, P_later: (L, 3, 3) T_map_base of the scans by the context.
         covariance: (L, 3, 3) as of LoopClosure.
-        accumulated: (L, 3, 3) sum of the covariances of the steps to the later scan, along the
+        accumulated: (L, 2, 3, 3) sum of the covariances of the steps to both scans, along the
             map's axes.
     """
 
@@ -281,9 +277,17 @@ class _AcceptedLoops:
         self.scans = scans
         self.T = np.array([c.T for c in accepted]).reshape(-1, 3, 3)
         self.covariance = np.array([c.covariance for c in accepted]).reshape(-1, 3, 3)
-        at = np.searchsorted(context.keyframes, scans[:, 1])
-        self.accumulated = _accumulate_covariance(context, chain)[at]
+        self.keyframes = np.searchsorted(context.keyframes, scans)
+        self.accumulated = _accumulate_covariance(context, chain)[self.keyframes]
         self.P_earlier, self.P_later = context.poses[scans].swapaxes(0, 1)
+
+    def nearby(self, n: int) -> Index:
+        """(K,) the others a few keyframes from loop n on both sides, with no break in between."""
+        near = (np.abs(self.keyframes - self.keyframes[n]) < _NEARBY).all(axis=1)
+        between = np.abs(self.accumulated[:, :, 0, 0] - self.accumulated[n, :, 0, 0])
+        near &= (between < 0.5 * loop_candidates.NO_ODOMETRY[0] ** 2).all(axis=1)
+        near[n] = False
+        return np.flatnonzero(near)
 
     def agree(self, n: int, others: Index) -> Bool:
         """(K,) whether loop n and others (K,) fit the motion between their later scans."""
@@ -292,7 +296,8 @@ class _AcceptedLoops:
         back = se2.inverse(self.P_later[b])
         predicted = self.P_earlier[a] @ self.T[a] @ se2.inverse(self.P_later[a]) @ self.P_later[b]
         d = se2.parameters(se2.inverse(predicted) @ self.P_earlier[b] @ self.T[b])
-        between = self.accumulated[b] - self.accumulated[a]
+        sides = self.accumulated[b] - self.accumulated[a]
+        between = (sides * np.sign(sides[:, :, :1, :1])).sum(axis=1)  # in either order
         between += se2.rotate_covariance(self.covariance[a], self.P_later[a])
         covariance = self.covariance[b] + se2.rotate_covariance(between, back)
         chi2 = (d * np.linalg.solve(covariance, d[..., None])[..., 0]).sum(axis=1)

@@ -107,7 +107,7 @@ class _ScanOdometry:
             match = match_scan(self.local_map.grid, scan, prior, self.usual[s], learned)
         else:
             match = accept_prior(prior)
-        match, contradicts = self._resolve_poor_match(t, scan, match, prior, other)
+        match, contradicts = self._resolve_poor_match(t, scan, match, prior, other, learned)
         slip = self.slip.detect(t, last, guess, self.local_map.grid, scan, match)
         if slip is not None:
             match = self._accept_slip(t, slip)
@@ -177,20 +177,28 @@ class _ScanOdometry:
         return slip.matches[-1]
 
     def _resolve_poor_match(
-        self, t: int, scan: Scan, match: ScanMatch, prior: MotionPrior, other: MotionPrior | None
+        self,
+        t: int,
+        scan: Scan,
+        match: ScanMatch,
+        prior: MotionPrior,
+        other: MotionPrior | None,
+        learned: MotionPrior | None,
     ) -> tuple[ScanMatch, bool]:
         """The match of scan t after a wider search, and whether it contradicts the local map.
 
         Starts a new segment if the robot may have been carried elsewhere before it.
         """
         grid, usual = self.local_map.grid, self.usual[self.recording.sensor[t]]
+        step = prior if learned is None else learned
         if len(scan.points) == 0 or usual == 0.0:
             return match, False
         if is_poor(match, usual):
-            # one scan that fits somewhere near tells no fault of odometry from a robot carried
-            # away while nothing was recorded: all that follow decide
-            if relocalization.is_gap(float(self.seconds_before[t]), self.seconds):
-                return self._start_segment(t, prior), False
+            # one scan that fits somewhere near does not say where the robot went, or was carried,
+            # while nothing was recorded: all that follow decide
+            seconds = float(self.seconds_before[t])
+            if relocalization.is_gap(seconds, self.seconds, step.translation_std):
+                return self._start_segment(t, step), False
             wider = widen_match(grid, scan, prior, other, match, usual)
             is_sure = match.cost - wider.cost > _SURE_GAIN
             if wider.widened and (is_sure or self._is_consistent_ahead(t, wider, usual)):
@@ -204,7 +212,7 @@ class _ScanOdometry:
             or self._is_consistent_ahead(t, match, usual)
         ):
             return match, contradicts
-        return self._start_segment(t, prior), False
+        return self._start_segment(t, step), False
 
     def _start_segment(self, t: int, prior: MotionPrior) -> ScanMatch:
         """Starts a new local map where the prior leads: loop closure decides where it belongs."""

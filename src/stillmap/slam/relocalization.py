@@ -1,41 +1,28 @@
 """Relocalization after the robot was carried elsewhere (kidnapped robot).
 
 The trajectory is cut into segments where the robot may have been carried. A segment stays where
-odometry leads if its keyframes fit there. Otherwise they are matched, over all headings, with the
-most similar earlier places. It is placed beside the others only if it contradicts odometry.
+odometry leads, within its covariance, if its keyframes fit there. It is placed beside the others
+only if it contradicts odometry and no known place fits.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.core.array_types import Float, Float32, Index
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.recording import Recording
-from stillmap.slam import local_map, loop_verification, motion_model, scan_matching
+from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
 from stillmap.slam.scan_hits import Scan, select_hits
 from stillmap.slam.scan_matching import MAX_OCCLUDED, ScanMatch
-from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
+from stillmap.slam.segment_placement import Segment, transfer_covariance
+from stillmap.slam.types import LoopClosure, LoopContext
 
-_MAX_QUERIES = 20  # keyframes of a segment that are matched
-_MAX_PLACES = 8  # places that each of them is matched with
-_RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
-_MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
-# keyframes that must fit, how many one that contradicts outweighs, and by how many a place among
-# the many that are tried must be better than that of odometry
-_MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN, _MARGIN_SHARE = 3, 4, 8, 0.3
-_MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
-# keyframes that must contradict the place of odometry, in all and as a share, or it is believed
-_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.5
-_SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
-_DRIFT_DISTANCE = 1.5  # m: smaller displacements are drift of odometry
-_STALL_TIME = 5.0  # s for which odometry may stand still unnoticed while the robot drives on
 _SEGMENT_SPACING = 10.0  # m between unconnected segments
 
 
@@ -45,44 +32,6 @@ def separate_segments(travelled: Float, breaks: list[int], metres: float) -> Flo
     for t in breaks:
         out[t:] += metres
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """A hypothesis of where a segment lies.
-
-    Attributes:
-        C: (3, 3) motion of the segment from where odometry has it.
-        fitting, contradicting: keyframes that fit the map before it, and that contradict it.
-        tested: keyframes, those that see other places included.
-        closures: that lead there.
-    """
-
-    C: Float
-    fitting: int
-    contradicting: int
-    tested: int
-    closures: list[LoopClosure] = field(default_factory=list)
-
-    @property
-    def score(self) -> float:
-        """Keyframes in favour; each one that contradicts outweighs several."""
-        return self.fitting - _CONTRADICTION_WEIGHT * self.contradicting
-
-    @property
-    def is_supported(self) -> bool:
-        """True if enough keyframes fit."""
-        return self.fitting >= _MIN_SUPPORT and self.score >= 0
-
-    def is_contradicted(self, min_share: float) -> bool:
-        """True if enough keyframes contradict it: in number, as a share, against those that fit."""
-        least = max(_MIN_CONTRADICTING, min_share * self.tested)
-        return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
-
-    def is_better(self, other: "Placement") -> bool:
-        """True if its score exceeds another's by the margin for testing many places."""
-        margin = max(_MARGIN, _MARGIN_SHARE * self.tested)
-        return self.score >= max(other.score, 0) + margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,144 +65,34 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
     """
     out = Relocalization(context, [], [], [], [])
     poses = context.poses.copy()
+    # covariance of the first scan of a segment given the map of those that are in place
+    previous, covariance = 0, np.zeros((3, 3))
     for first, last in itertools.pairwise([*candidates, len(poses)]):
         context = dataclasses.replace(context, poses=poses)
-        earlier = context.keyframes[context.keyframes < first].tolist()
-        before = context.build_map(context.recording.iter_scans(earlier, context.e))
-        here = Placement(np.eye(3), *_count_support(context, before, np.eye(3), first, last))
+        covariance = transfer_covariance(context, covariance, previous, first)
+        segment = Segment(context, first, last, covariance)
+        previous, is_placed, C = first, True, np.eye(3)
+        here = segment.follow_odometry()
+        there = None if here.is_supported else segment.find_place()
         if here.is_supported:
-            continue
-        there = _find_placement(context, before, first, last)
-        if there is not None and there.is_better(here):
-            if _exceeds_odometry_error(context, there.C, first):
-                out.breaks.append(first)
-            poses[first:last] = there.C @ poses[first:last]
+            C = here.C
+        elif there is not None and there.score > max(here.score, 0.0):
+            C = there.C
             out.closures.extend(there.closures)
-        elif here.is_contradicted(_MIN_CONTRADICTING_SHARE):
-            poses[first:last] = _offset_beside(context, first) @ poses[first:last]
+            if there.is_elsewhere:
+                out.breaks.append(first)
+        elif here.is_contradicted:
+            C = _offset_beside(context, first)
             out.breaks.append(first)
             out.unconnected.append(first)
-        elif there is not None or here.contradicting > here.fitting:
-            out.ambiguous.append(first)
+        else:
+            is_placed = False
+            C = here.C if here.fitting > here.contradicting else C
+            if there is not None or here.contradicting > here.fitting:
+                out.ambiguous.append(first)
+        covariance = np.zeros((3, 3)) if is_placed else covariance
+        poses[first:last] = C @ poses[first:last]
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
-
-
-def _exceeds_odometry_error(context: LoopContext, C: Float, first: int) -> bool:
-    """True if a segment is displaced by C (3, 3) farther than odometry drifts or a stall hides."""
-    x, y, _ = se2.parameters(se2.inverse(context.poses[first]) @ C @ context.poses[first])
-    seconds = 1e-9 * float(context.recording.stamp_ns[-1] - context.recording.stamp_ns[0])
-    speed = float(local_map.travelled_distance(context.poses)[-1]) / max(seconds, 1e-9)
-    return float(np.hypot(x, y)) > max(_DRIFT_DISTANCE, _STALL_TIME * speed)
-
-
-def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
-    """Keyframes of a segment, each matched with the earlier places that look most alike."""
-    keyframes, length = context.keyframes, loop_verification.SUBMAP_TRAVEL
-    segment = keyframes[(keyframes >= first) & (keyframes < last)]
-    before = keyframes[keyframes < first]
-    signatures = np.array([_range_signature(context, t) for t in before])
-    translation, rotation = context.search_distance, np.pi
-    std = translation / loop_verification.SEARCH_STDS, rotation / loop_verification.SEARCH_STDS
-    submaps = {}
-    for later in _select_evenly(segment, _MAX_QUERIES):
-        distance = np.abs(signatures - _range_signature(context, later)).sum(axis=1)
-        stretches = np.round(context.travelled[before] / length)
-        for stretch in _nearest_stretches(stretches, distance):
-            if stretch not in submaps:
-                submaps[stretch] = loop_verification.build_submap(context, stretch * length)
-            same = np.flatnonzero(stretches == stretch)
-            earlier = int(before[same[np.argmin(distance[same])]])
-            candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
-            closure = loop_verification.verify_candidate(
-                context, submaps[stretch], candidate, *std, loop_verification.MIN_EXPLAINED
-            )
-            if not closure.rejected:
-                yield closure
-
-
-def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
-    """The stretches with the most similar scans, the best first, and the last one."""
-    found = dict.fromkeys(stretches[np.argsort(distance, kind="stable")].tolist())
-    return list(dict.fromkeys([*list(found)[:_MAX_PLACES], float(stretches[-1])]))
-
-
-def _range_signature(context: LoopContext, t: int) -> Float:
-    """(24,) cumulative range histogram of a scan, which is invariant to rotation."""
-    scan = context.hits(t)
-    ranges = np.linalg.norm(scan.points, axis=1)
-    total = np.histogram(ranges, _RANGE_BINS, weights=scan.weights)[0].cumsum()
-    shares: Float = total / max(float(total[-1]), 1e-9)
-    return shares
-
-
-def _correction(context: LoopContext, closure: LoopClosure) -> Float:
-    """(3, 3) motion of a segment that satisfies a closure."""
-    there = context.poses[closure.earlier] @ closure.T
-    C: Float = there @ se2.inverse(context.poses[closure.later])
-    return C
-
-
-def _find_placement(
-    context: LoopContext, before: _core.OccupancyGrid2D, first: int, last: int
-) -> Placement | None:
-    """The place at which most keyframes of the segment fit.
-
-    Rooms look alike: a place counts only if the rest of the segment does not contradict it.
-    """
-    best: Placement | None = None
-    closures = list(_match_segment(context, first, last))
-    for closure in _deduplicate(context, closures):
-        C = _correction(context, closure)
-        placement = Placement(C, *_count_support(context, before, C, first, last))
-        if placement.is_supported and (best is None or placement.score > best.score):
-            best = placement
-    if best is None:
-        return None
-    return dataclasses.replace(best, closures=[c for c in closures if _is_same(context, best.C, c)])
-
-
-def _deduplicate(context: LoopContext, closures: list[LoopClosure]) -> list[LoopClosure]:
-    """One closure per hypothesis, those that explain most."""
-    kept = list[LoopClosure]()
-    for closure in sorted(closures, key=lambda closure: -closure.explained):
-        if len(kept) == _MAX_HYPOTHESES:
-            break
-        if not any(_is_same(context, _correction(context, other), closure) for other in kept):
-            kept.append(closure)
-    return kept
-
-
-def _count_support(
-    context: LoopContext, before: _core.OccupancyGrid2D, C: Float, first: int, last: int
-) -> tuple[int, int, int]:
-    """Keyframes of a segment moved by C (3, 3) that fit a map, that contradict it, and all."""
-    keyframes = context.keyframes[(context.keyframes >= first) & (context.keyframes < last)]
-    fitting = contradicting = 0
-    tested = _select_evenly(keyframes, _MAX_TESTED)
-    for t in tested:
-        scan = context.hits(t)
-        prior = motion_model.gaussian_prior(C @ context.poses[t], _SAME_DISTANCE, _SAME_ANGLE)
-        match = scan_matching.refine_pose(before, scan, prior, prior.T_map_base)
-        occluded = scan_matching.occluded_share(before, scan, match.T_map_base)
-        if occluded > scan_matching.MAX_OCCLUDED:
-            contradicting += 1
-        elif match.explained >= loop_verification.MIN_EXPLAINED:
-            fitting += 1
-    return fitting, contradicting, len(tested)
-
-
-def _select_evenly(keyframes: Index, max_count: int) -> list[int]:
-    """At most `max_count` of them, evenly spread."""
-    which = np.unique(np.linspace(0, len(keyframes) - 1, max_count).round().astype(int))
-    out: list[int] = keyframes[which].tolist()
-    return out
-
-
-def _is_same(context: LoopContext, correction: Float, closure: LoopClosure) -> bool:
-    """True if a closure asks for that correction (3, 3) of its segment."""
-    there = context.poses[closure.earlier] @ closure.T
-    d = se2.parameters(se2.inverse(correction @ context.poses[closure.later]) @ there)
-    return bool(np.hypot(d[0], d[1]) < _SAME_DISTANCE and abs(d[2]) < _SAME_ANGLE)
 
 
 def _offset_beside(context: LoopContext, first: int) -> Float:
@@ -275,18 +114,21 @@ _AGREE_SHARE, _CONTRADICT_SHARE = 0.6, 0.4  # explained, of the usual share
 _DRIFT, _MIN_STD = 0.04, 0.05  # m and rad of odometry error per m or rad, and at least
 
 
-# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere
-_GAP, _GAP_RATIO = 5.0, 20.0
+# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere; or
+# in which it may have driven metres from where odometry leads: m, std
+_GAP, _GAP_RATIO, _GAP_RATIO_DRIVEN, _DRIVEN_STD = 5.0, 20.0, 4.0, 0.5
 
 
-def is_gap(seconds: float, usual: float) -> bool:
-    """True if the time between two scans is a gap, in which the robot may have been carried.
+def is_gap(seconds: float, usual: float, translation_std: float) -> bool:
+    """True if the time between two scans is a gap, after which the robot may be anywhere near.
 
     Args:
         seconds: between them.
         usual: s between scans.
+        translation_std: m, of the motion prior.
     """
-    return seconds > max(_GAP, _GAP_RATIO * usual)
+    ratio = _GAP_RATIO if translation_std <= _DRIVEN_STD else _GAP_RATIO_DRIVEN
+    return seconds > max(_GAP, ratio * usual)
 
 
 class Evidence(Enum):

@@ -148,7 +148,7 @@ def _loosen_prior(
 
 def accept_prior(prior: MotionPrior) -> ScanMatch:
     """The prior's mean and covariance, for a scan without a map to match."""
-    covariance = np.diag(1.0 / np.diag(prior.information))
+    covariance: Float = np.linalg.inv(prior.information)
     return ScanMatch(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
 
 

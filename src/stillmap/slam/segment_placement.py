@@ -1,0 +1,251 @@
+"""Placement of a segment of the trajectory in the map of the scans before it.
+
+Its keyframes are followed along that map one after the other, each within the covariance since the
+last one that fitted: a place where odometry leads drifts as any other.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stillmap.core import se2
+from stillmap.core.array_types import Float, Index
+from stillmap.slam import loop_verification, scan_matching
+from stillmap.slam.loop_candidates import drift_std
+from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
+
+_MAX_QUERIES = 8  # keyframes of a segment that are matched
+_MAX_PLACES = 8  # places that each of them is matched with
+_RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
+_MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
+# keyframes that must fit, and how many one that contradicts outweighs; nats, at least and per
+# keyframe, that a place costs where odometry does not lead: many are tried
+_MIN_SUPPORT, _CONTRADICTION_WEIGHT, _ELSEWHERE, _ELSEWHERE_PER_KEYFRAME = 3, 4, 8.0, 0.3
+_MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
+# keyframes that must contradict the place of odometry, in all and as a share, or it is believed
+_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.5
+_SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A hypothesis of where a segment lies.
+
+    Attributes:
+        C: (3, 3) motion of the segment from where odometry has it.
+        fitting, contradicting: keyframes that fit the map before it, and that contradict it.
+        tested: keyframes, those that see other places included.
+        cost: nats of the motion under odometry; no more than that of a robot that was carried.
+        closures: that lead there.
+    """
+
+    C: Float
+    fitting: int
+    contradicting: int
+    tested: int
+    cost: float = 0.0
+    closures: list[LoopClosure] = field(default_factory=list)
+
+    @property
+    def score(self) -> float:
+        """Keyframes in favour; each one that contradicts outweighs several."""
+        return self.fitting - _CONTRADICTION_WEIGHT * self.contradicting - self.cost
+
+    @property
+    def is_supported(self) -> bool:
+        """True if enough keyframes fit."""
+        return self.fitting >= _MIN_SUPPORT and self.score >= 0
+
+    @property
+    def is_contradicted(self) -> bool:
+        """True if enough keyframes contradict it: in number, as a share, against those that fit."""
+        least = max(_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE * self.tested)
+        return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """True if odometry does not lead there."""
+        return self.cost >= _cost_of_carrying(self.tested)
+
+
+class Segment:
+    """Scans from `first` on, before `last`, and the map of those before them.
+
+    Args:
+        context: the trajectory, with the segment where odometry leads.
+        first, last: range of scans.
+        covariance: (3, 3) of x, y, heading of the first scan, map axes.
+    """
+
+    def __init__(self, context: LoopContext, first: int, last: int, covariance: Float) -> None:
+        keyframes = context.keyframes
+        self._context, self._first, self._covariance = context, first, covariance
+        self._earlier = keyframes[keyframes < first]
+        self._keyframes = keyframes[(keyframes >= first) & (keyframes < last)]
+        self._tested = _select_evenly(self._keyframes, _MAX_TESTED)
+        scans = context.recording.iter_scans(self._earlier.tolist(), context.e)
+        self._map = context.build_map(scans)
+
+    def follow_odometry(self) -> Placement:
+        """The segment where odometry leads, within its covariance."""
+        return self._follow(np.eye(3), self._first, self._covariance)
+
+    def find_place(self) -> Placement | None:
+        """The place at which most keyframes of the segment fit, where odometry leads or elsewhere.
+
+        Rooms look alike: a place counts only if the rest of the segment does not contradict it.
+        """
+        best: Placement | None = None
+        closures = list(self._match_places())
+        for closure in self._deduplicate(closures):
+            placement = self._follow(self._motion(closure), closure.later, np.zeros((3, 3)))
+            cost = min(self._cost(placement.C), _cost_of_carrying(placement.tested))
+            placement = dataclasses.replace(placement, cost=cost)
+            if placement.is_supported and (best is None or placement.score > best.score):
+                best = placement
+        if best is None:
+            return None
+        same = [closure for closure in closures if self._is_same(best.C, closure)]
+        return dataclasses.replace(best, closures=same)
+
+    def _follow(self, C: Float, start: int, covariance: Float) -> Placement:
+        """Keyframes matched with the map one after the other, from `start` on, then backwards.
+
+        Args:
+            C: (3, 3) motion of keyframe `start` from where odometry has it.
+            start: a keyframe.
+            covariance: (3, 3) of its pose, map axes.
+        """
+        context, k = self._context, int(np.searchsorted(self._tested, start))
+        fitting, contradicting, C_first = 0, 0, None
+        for scans in (self._tested[k:], self._tested[:k][::-1]):
+            moved, spread, previous = C, covariance, start
+            for t in scans:
+                spread = transfer_covariance(context, spread, previous, t, moved)
+                metres = abs(float(context.travelled[t] - context.travelled[previous]))
+                prior = _drifted_prior(moved @ context.poses[t], spread, metres)
+                previous, scan = t, context.hits(t)
+                if len(scan.points) == 0:
+                    continue
+                usual = float(context.explained[t])
+                match = scan_matching.match_scan(self._map, scan, prior, usual)
+                occluded = scan_matching.occluded_share(self._map, scan, match.T_map_base)
+                if occluded > scan_matching.MAX_OCCLUDED:
+                    contradicting += 1
+                elif match.explained >= loop_verification.MIN_EXPLAINED:
+                    fitting += 1
+                    moved = match.T_map_base @ se2.inverse(context.poses[t])
+                    spread = np.zeros((3, 3))
+                    C_first = moved if C_first is None else C_first
+        C_first = C if C_first is None else C_first
+        return Placement(C_first, fitting, contradicting, len(self._tested))
+
+    def _cost(self, C: Float) -> float:
+        """Nats of a motion (3, 3) of the segment under odometry."""
+        T_odom = self._context.poses[self._first]
+        prior = _drifted_prior(T_odom, self._covariance, 0.0)
+        return prior.cost(C @ T_odom)
+
+    def _match_places(self) -> Iterator[LoopClosure]:
+        """Keyframes of the segment, each matched with the earlier places that look most alike."""
+        context, before = self._context, self._earlier
+        length = loop_verification.SUBMAP_TRAVEL
+        signatures = np.array([_range_signature(context, t) for t in before.tolist()])
+        translation, rotation = context.search_distance, np.pi
+        std = translation / loop_verification.SEARCH_STDS, rotation / loop_verification.SEARCH_STDS
+        stretches = np.round(context.travelled[before] / length)
+        submaps = {}
+        for later in _select_evenly(self._keyframes, _MAX_QUERIES):
+            distance = np.abs(signatures - _range_signature(context, later)).sum(axis=1)
+            for stretch in _nearest_stretches(stretches, distance):
+                if stretch not in submaps:
+                    submaps[stretch] = loop_verification.build_submap(context, stretch * length)
+                same = np.flatnonzero(stretches == stretch)
+                earlier = int(before[same[np.argmin(distance[same])]])
+                candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
+                closure = loop_verification.verify_candidate(
+                    context, submaps[stretch], candidate, *std, loop_verification.MIN_EXPLAINED
+                )
+                if not closure.rejected:
+                    yield closure
+
+    def _motion(self, closure: LoopClosure) -> Float:
+        """(3, 3) motion of the segment that satisfies a closure."""
+        poses = self._context.poses
+        C: Float = poses[closure.earlier] @ closure.T @ se2.inverse(poses[closure.later])
+        return C
+
+    def _deduplicate(self, closures: list[LoopClosure]) -> list[LoopClosure]:
+        """One closure per hypothesis, those that explain most."""
+        kept = list[LoopClosure]()
+        for closure in sorted(closures, key=lambda closure: -closure.explained):
+            if len(kept) == _MAX_HYPOTHESES:
+                break
+            if not any(self._is_same(self._motion(other), closure) for other in kept):
+                kept.append(closure)
+        return kept
+
+    def _is_same(self, C: Float, closure: LoopClosure) -> bool:
+        """True if a closure asks for that motion (3, 3) of the segment."""
+        later = self._context.poses[closure.later]
+        d = se2.parameters(se2.inverse(C @ later) @ self._motion(closure) @ later)
+        return bool(np.hypot(d[0], d[1]) < _SAME_DISTANCE and abs(d[2]) < _SAME_ANGLE)
+
+
+def transfer_covariance(
+    context: LoopContext, covariance: Float, i: int, j: int, C: Float | None = None
+) -> Float:
+    """Covariance (3, 3) of the pose of scan j from that of scan i, x, y (map axes) and heading.
+
+    An error of the heading leads aside what follows; blind steps add theirs.
+
+    Args:
+        context: the trajectory.
+        covariance: (3, 3) of scan i.
+        i, j: scans, in any order.
+        C: (3, 3) motion of both from where the context has them; None: none.
+    """
+    step = context.poses[j, :, 2] - context.poses[i, :, 2]
+    x, y, _ = step if C is None else C @ step
+    lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    blind = context.drift[min(i, j) + 1 : max(i, j) + 1].sum(axis=0)
+    out: Float = lever @ covariance @ lever.T + blind
+    return out
+
+
+def _drifted_prior(T_map_base: Float, covariance: Float, metres: float) -> MotionPrior:
+    """The prior about a pose (3, 3) with a covariance (3, 3) and the drift of so many metres."""
+    translation, rotation = drift_std(metres)
+    total = covariance + np.diag(np.square([translation, translation, rotation]))
+    std = float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[1])), float(np.sqrt(total[2, 2]))
+    return MotionPrior(se2.normalize(T_map_base), np.linalg.inv(total), *std, is_odometry=True)
+
+
+def _cost_of_carrying(tested: int) -> float:
+    """Nats of a robot that was carried to one of many places, in terms of so many keyframes."""
+    return max(_ELSEWHERE, _ELSEWHERE_PER_KEYFRAME * tested)
+
+
+def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
+    """The stretches with the most similar scans, the best first, and the last one."""
+    found = dict.fromkeys(stretches[np.argsort(distance, kind="stable")].tolist())
+    return list(dict.fromkeys([*list(found)[:_MAX_PLACES], float(stretches[-1])]))
+
+
+def _range_signature(context: LoopContext, t: int) -> Float:
+    """(24,) cumulative range histogram of a scan, which is invariant to rotation."""
+    scan = context.hits(t)
+    ranges = np.linalg.norm(scan.points, axis=1)
+    total = np.histogram(ranges, _RANGE_BINS, weights=scan.weights)[0].cumsum()
+    shares: Float = total / max(float(total[-1]), 1e-9)
+    return shares
+
+
+def _select_evenly(keyframes: Index, max_count: int) -> list[int]:
+    """At most `max_count` of them, evenly spread."""
+    which = np.unique(np.linspace(0, len(keyframes) - 1, max_count).round().astype(int))
+    out: list[int] = keyframes[which].tolist()
+    return out
