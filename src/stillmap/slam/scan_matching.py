@@ -148,7 +148,7 @@ def _loosen_prior(
 
 def accept_prior(prior: MotionPrior) -> ScanMatch:
     """The prior's mean and covariance, for a scan without a map to match."""
-    covariance: Float = np.linalg.inv(prior.information)
+    covariance = np.asarray(np.linalg.inv(prior.information), np.float64)
     return ScanMatch(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
 
 
