@@ -53,7 +53,10 @@ ABLATION = (
     ),
     Variant(
         "the first place that fits is taken",
-        constants={"relocalization._MARGIN": 0, "relocalization._MARGIN_SHARE": 0.0},
+        constants={
+            "segment_placement._ELSEWHERE": 0.0,
+            "segment_placement._ELSEWHERE_PER_KEYFRAME": 0.0,
+        },
     ),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),
     Variant(
