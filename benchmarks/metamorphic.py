@@ -11,7 +11,7 @@ error, largest: of the relations between scans that are kept and have a pose, m;
 of the same relations in the map of the unchanged log, of which `largest_before` is the largest.
 step: the largest from one pose to the next off the odometry of the unchanged log, m/s: by it logs
 without relations are judged. tear: see `TEAR_METRES`. breaks: where the result says that the robot
-was carried; apart: parts that it says lie beside the map, and pieces that it did not place.
+was carried; apart: pieces that it did not place.
 
 A row is appended to --out when its run ends. The table has the ratio, or without relations the
 step, T where the map is torn, "refused" for exit status 2, and DEFECT for any other but 0.
@@ -278,7 +278,7 @@ def score(job: Job, log: Log, logs: Sequence[Log]) -> dict[str, Any]:
         "step": round(steps[0], 3),
         "tear": int(worst[0] > max(worst[2], TEAR_FACTOR * worst[1])),
         "breaks": len(doubts.get("carried_before", [])),
-        "apart": len(doubts.get("beside_the_map_from", [])) + left_out,
+        "apart": left_out,
     }
 
 

@@ -299,7 +299,6 @@ def result():
             [7],
             [7, 9],
             breaks=[20],
-            unconnected=[20],
             ambiguous=[31],
             bare_stretches=[BareStretch(12, 19, 3.25, 0.4)],
         ),

@@ -94,7 +94,6 @@ def test_doubts_loops_counts_and_areas(tmp_path, result):
         "odometry_disagrees": [7, 9],
         "found_by_wider_search": [7],
         "carried_before": [20],
-        "beside_the_map_from": [20],
         "ambiguous": [31],
         "length_unknown": [{"first": 12, "last": 19, "metres": 3.25, "std": 0.4}],
     }

@@ -109,21 +109,15 @@ def _scan_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
         (found.widened, "found by a wider search, outside the uncertainty of odometry", ""),
         (
             found.ambiguous,
-            "from there on, another place fits about as well as that of odometry, which was kept",
+            "from there on, the scans contradict the map where odometry leads, or another place "
+            "fits about as well; that of odometry was kept",
             "look whether walls are doubled there; if so, record again with more of the way "
-            "between the two places",
+            "between the two places, or map the part before and the part after on their own",
         ),
         (
-            [scan for scan in found.breaks if scan not in found.unconnected],
+            found.breaks,
             "the robot was carried elsewhere before, and relocalized among the known places",
             "",
-        ),
-        (
-            found.unconnected,
-            "the robot was carried elsewhere before, to where no place is known: the part of the "
-            "map from there on lies at an arbitrary pose",
-            "record again so that the robot ends where it was before, or map the part before and "
-            "the part after on their own",
         ),
         (
             _lost_scans(best, recording),

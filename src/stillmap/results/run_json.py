@@ -79,7 +79,6 @@ def _doubts(result: MappingResult) -> dict[str, Any]:
         "odometry_disagrees": doubts.odometry_faults,
         "found_by_wider_search": doubts.widened,
         "carried_before": doubts.breaks,
-        "beside_the_map_from": doubts.unconnected,
         "ambiguous": doubts.ambiguous,
         "length_unknown": [
             {

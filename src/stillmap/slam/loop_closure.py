@@ -63,7 +63,6 @@ def close_loops(
         diagnostics=dataclasses.replace(
             odometry.diagnostics,
             breaks=relocalized.breaks,
-            unconnected=relocalized.unconnected,
             ambiguous=relocalized.ambiguous,
             bare_stretches=_without_loops(odometry.diagnostics.bare_stretches, found),
         ),

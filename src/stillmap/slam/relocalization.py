@@ -1,8 +1,7 @@
 """Relocalization after the robot was carried elsewhere (kidnapped robot).
 
 The trajectory is cut into segments where the robot may have been carried. A segment stays where
-odometry leads, within its covariance, if its keyframes fit there. It is placed beside the others
-only if it contradicts odometry and no known place fits.
+odometry leads, within its covariance, unless another known place fits much better.
 """
 
 import dataclasses
@@ -23,8 +22,6 @@ from stillmap.slam.scan_matching import MAX_OCCLUDED, ScanMatch
 from stillmap.slam.segment_placement import Segment, transfer_covariance
 from stillmap.slam.types import LoopClosure, LoopContext
 
-_SEGMENT_SPACING = 10.0  # m between unconnected segments
-
 
 def separate_segments(travelled: Float, breaks: list[int], metres: float) -> Float:
     """(T,) m travelled with `metres` more at each break, so that no submap reaches across."""
@@ -42,28 +39,26 @@ class Relocalization:
         context: the trajectory with all segments in place.
         closures: that connect them.
         breaks: first scans of segments that do not follow by odometry.
-        unconnected: those of them without a known place.
-        ambiguous: first scans of segments that would fit elsewhere about as well.
+        ambiguous: first scans of segments that contradict the map where odometry leads, or would
+            fit elsewhere about as well.
     """
 
     context: LoopContext
     closures: list[LoopClosure]
     breaks: list[int]
-    unconnected: list[int]
     ambiguous: list[int]
 
 
 def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocalization:
     """Decides for each segment whether odometry leads there, or the robot was carried elsewhere.
 
-    Odometry is believed unless the segment contradicts the map before it there, or fits much better
-    elsewhere.
+    Odometry is believed unless the segment fits much better elsewhere.
 
     Args:
         context: the trajectory.
         candidates: first scans of all segments but the first.
     """
-    out = Relocalization(context, [], [], [], [])
+    out = Relocalization(context, [], [], [])
     poses = context.poses.copy()
     # covariance of the first scan of a segment given the map of those that are in place
     previous, covariance = 0, np.zeros((3, 3))
@@ -81,10 +76,6 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
             out.closures.extend(there.closures)
             if there.is_elsewhere:
                 out.breaks.append(first)
-        elif here.is_contradicted:
-            C = _offset_beside(context, first)
-            out.breaks.append(first)
-            out.unconnected.append(first)
         else:
             is_placed = False
             C = here.C if here.fitting > here.contradicting else C
@@ -93,16 +84,6 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         covariance = np.zeros((3, 3)) if is_placed else covariance
         poses[first:last] = C @ poses[first:last]
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
-
-
-def _offset_beside(context: LoopContext, first: int) -> Float:
-    """(3, 3) that moves the scans from `first` on to the right of all earlier ones."""
-    points = [context.hits(t).points for t in context.keyframes.tolist()]
-    max_range = np.array([np.linalg.norm(of_scan, axis=1).max(initial=0.0) for of_scan in points])
-    x, is_new = context.poses[context.keyframes, 0, 2], context.keyframes >= first
-    right = (x + max_range)[~is_new].max()
-    left = (x - max_range)[is_new].min()
-    return se2.matrix(right - left + _SEGMENT_SPACING, 0.0, 0.0)
 
 
 _MAX_SCANS = 300  # ahead

@@ -25,8 +25,6 @@ _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
 # keyframe, that a place costs where odometry does not lead: many are tried
 _MIN_SUPPORT, _CONTRADICTION_WEIGHT, _ELSEWHERE, _ELSEWHERE_PER_KEYFRAME = 3, 4, 8.0, 0.3
 _MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
-# keyframes that must contradict the place of odometry, in all and as a share, or it is believed
-_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.5
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 
 
@@ -58,12 +56,6 @@ class Placement:
     def is_supported(self) -> bool:
         """True if enough keyframes fit."""
         return self.fitting >= _MIN_SUPPORT and self.score >= 0
-
-    @property
-    def is_contradicted(self) -> bool:
-        """True if enough keyframes contradict it: in number, as a share, against those that fit."""
-        least = max(_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE * self.tested)
-        return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
 
     @property
     def is_elsewhere(self) -> bool:

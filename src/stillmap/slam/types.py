@@ -88,16 +88,14 @@ class Diagnostics(ShortRepr):
         odometry_faults: odometry was rejected.
         breaks: first scans after the robot was carried elsewhere; before loop closure, those
             before which it may have been.
-        unconnected: those breaks after which no known place was recognized.
-        ambiguous: first scans of segments that would fit another place about as well as the one
-            that odometry leads to.
+        ambiguous: first scans of segments that contradict the map where odometry leads, or fit
+            another place about as well.
         bare_stretches: whose length the scans do not show, and no accepted loop measures.
     """
 
     widened: list[int] = field(default_factory=list)
     odometry_faults: list[int] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
-    unconnected: list[int] = field(default_factory=list)
     ambiguous: list[int] = field(default_factory=list)
     bare_stretches: list[BareStretch] = field(default_factory=list)
 
