@@ -98,7 +98,7 @@ class _ScanOdometry:
     def register(self, t: int) -> None:
         """Matches scan t and adds it to the local map."""
         last, guess = self.poses[t - 1], self._predict(t)
-        prior, other = self._priors(t, guess, self.slip.is_slipping(t, last, guess))
+        prior, alternative = self._priors(t, guess, self.slip.is_slipping(t, last, guess))
         scan, s = select_hits(self.recording, self.e, t), self.recording.sensor[t]
         # without odometry, the first scan of a sensor with another view has nothing to match
         has_map = prior.is_odometry or self.local_map.has_sensor(s)
@@ -107,12 +107,12 @@ class _ScanOdometry:
             match = match_scan(self.local_map.grid, scan, prior, self.usual[s], learned)
         else:
             match = accept_prior(prior)
-        match, contradicts = self._resolve_poor_match(t, scan, match, prior, other, learned)
+        match, contradicts = self._resolve_poor_match(t, scan, match, prior, alternative, learned)
         slip = self.slip.detect(t, last, guess, self.local_map.grid, scan, match)
         if slip is not None:
             match = self._accept_slip(t, slip)
             guess = self._predict(t)
-        self._record(t, match, is_fault=self._rejects_odometry(t, prior, other, match))
+        self._record(t, match, is_fault=self._rejects_odometry(t, prior, alternative, match))
         self.drift[t] = motion_model.blind_drift(learned or prior, match.covariance)
         self.unmeasured[t] = motion_model.unmeasured_variance(
             learned or prior, match.covariance, float(self.seconds_before[t])
@@ -160,12 +160,12 @@ class _ScanOdometry:
         return (measured, guess) if is_valid else (guess, measured)
 
     def _rejects_odometry(
-        self, t: int, prior: MotionPrior, other: MotionPrior | None, match: ScanMatch
+        self, t: int, prior: MotionPrior, alternative: MotionPrior | None, match: ScanMatch
     ) -> bool:
         """True if odometry was not the prior of scan t, and leaps or contradicts its match."""
-        if self.steps is None or prior.is_odometry or other is None:
+        if self.steps is None or prior.is_odometry or alternative is None:
             return False
-        return not self.steps.plausible[t - 1] or is_inconsistent(other, match.T_map_base)
+        return not self.steps.plausible[t - 1] or is_inconsistent(alternative, match.T_map_base)
 
     def _accept_slip(self, t: int, slip: SlipHypothesis) -> ScanMatch:
         """Replaces the poses since odometry stopped; returns the match of scan t."""
@@ -182,7 +182,7 @@ class _ScanOdometry:
         scan: Scan,
         match: ScanMatch,
         prior: MotionPrior,
-        other: MotionPrior | None,
+        alternative: MotionPrior | None,
         learned: MotionPrior | None,
     ) -> tuple[ScanMatch, bool]:
         """The match of scan t after a wider search, and whether it contradicts the local map.
@@ -199,7 +199,7 @@ class _ScanOdometry:
             seconds = float(self.seconds_before[t])
             if relocalization.is_gap(seconds, self.seconds, step.translation_std):
                 return self._start_segment(t, step), False
-            wider = widen_match(grid, scan, prior, other, match, usual)
+            wider = widen_match(grid, scan, prior, alternative, match, usual)
             is_sure = match.cost - wider.cost > _SURE_GAIN
             if wider.widened and (is_sure or self._is_consistent_ahead(t, wider, usual)):
                 return wider, False

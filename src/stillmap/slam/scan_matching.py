@@ -102,7 +102,7 @@ def widen_match(
     grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
-    other: MotionPrior | None,
+    alternative: MotionPrior | None,
     match: ScanMatch,
     usual: float,
 ) -> ScanMatch:
@@ -112,13 +112,13 @@ def widen_match(
         grid: the map so far.
         scan: its hits, at least one.
         prior: as of `match_scan`.
-        other: a second prior.
+        alternative: a second prior.
         match: a poor match within the prior.
         usual: recent average of the explained share.
     """
     threshold = _WIDEN_BELOW * usual
     cost = _evidence_cost(prior, match)
-    for mean, window in itertools.product((prior, other), _WIDE_WINDOWS):
+    for mean, window in itertools.product((prior, alternative), _WIDE_WINDOWS):
         if mean is None or match.explained >= threshold:
             continue
         wide = motion_model.widen_prior(mean, *(half / _SEARCH_STDS for half in window))

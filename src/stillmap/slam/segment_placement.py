@@ -54,7 +54,7 @@ class Placement:
 
     @property
     def is_supported(self) -> bool:
-        """True if enough keyframes fit."""
+        """True if enough keyframes fit, and outweigh those that contradict."""
         return self.fitting >= _MIN_SUPPORT and self.score >= 0
 
     @property
@@ -176,7 +176,7 @@ class Segment:
         for closure in sorted(closures, key=lambda closure: -closure.explained):
             if len(kept) == _MAX_HYPOTHESES:
                 break
-            if not any(self._is_same(self._motion(other), closure) for other in kept):
+            if not any(self._is_same(self._motion(better), closure) for better in kept):
                 kept.append(closure)
         return kept
 
@@ -223,8 +223,8 @@ def _cost_of_carrying(tested: int) -> float:
 
 def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
     """The stretches with the most similar scans, the best first, and the last one."""
-    found = dict.fromkeys(stretches[np.argsort(distance, kind="stable")].tolist())
-    return list(dict.fromkeys([*list(found)[:_MAX_PLACES], float(stretches[-1])]))
+    by_distance = dict.fromkeys(stretches[np.argsort(distance, kind="stable")].tolist())
+    return list(dict.fromkeys([*list(by_distance)[:_MAX_PLACES], float(stretches[-1])]))
 
 
 def _range_signature(context: LoopContext, t: int) -> Float:
