@@ -4,6 +4,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include <array>
+#include <cmath>
 #include <limits>
 #include <optional>
 
@@ -64,6 +65,21 @@ Box<D> box_around(const OccupancyGrid<D>& grid) {
   return box;
 }
 
+// Log marginal likelihood of all counts, each cell's occupancy integrated out: sum over cells of
+// ln B(alpha + a, beta + b) - ln B(a, b).
+template <int D>
+double log_evidence(const OccupancyGrid<D>& grid, double a, double b) {
+  require(a > 0.0 && b > 0.0, "a, b: expected positive pseudo-counts");
+  const double of_hits = std::lgamma(a), of_both = std::lgamma(a + b) - of_hits - std::lgamma(b);
+  double sum = 0.0;
+  for_each_observed(grid, [&](const Cell<D>&, const CellCounts& c) {
+    const double alpha = from_fixed(c.alpha), beta = from_fixed(c.beta);
+    const double hits = c.alpha == 0 ? of_hits : std::lgamma(alpha + a);
+    sum += hits + std::lgamma(beta + b) - std::lgamma(alpha + beta + a + b) + of_both;
+  });
+  return sum;
+}
+
 template <int D>
 auto box_of(const OccupancyGrid<D>& grid) {
   const Box<D> box = box_around(grid);
@@ -106,6 +122,9 @@ void bind(nb::module_& m, const char* name) {
       .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")
       .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
            "(K, 2) float64: sums alpha, beta of cells (K, D) int64; 0, 0 for unobserved cells.")
+      .def("log_evidence", &log_evidence<D>, nb::arg("a"), nb::arg("b"),
+           "Log marginal likelihood of the counts in nats: the occupancy of each cell has the "
+           "prior Beta(a, b) and is integrated out.")
       .def("bounding_box", &box_of<D>,
            "first_cell (D,) int64 and shape of the bounding box of observed cells, as returned by "
            "`dense`.")

@@ -341,6 +341,7 @@ def _m_step(
         lambda stage, done, total: progress(stage, number, done, total),
         initial=before.m_step if before and _needs_refinement_only(recording, before) else None,
         earlier_poses=None if before is None else before.poses,
+        earlier=None if before is None else before.m_step,
         with_grid=em.needs_counts(options.estimator),
         # (10) as printed counts beams up to their end
         free_space_margin=0.0 if options.estimator == "paper" else slam.FREE_SPACE_MARGIN,

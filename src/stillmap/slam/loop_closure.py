@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,11 +20,35 @@ from stillmap.slam import (
 from stillmap.slam.heading_alignment import align_headings
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
-from stillmap.slam.relocalization import Relocalization
 from stillmap.slam.types import BareStretch, LoopClosure, LoopContext, MStepResult, ScanProgress
 
 KEYFRAME_DISTANCE, SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
 _MAX_CHI2 = 16.0  # 3 degrees of freedom; above it the graph rejects a loop
+
+
+def place_segments(
+    recording: Recording, e: Float32, options: SlamOptions, matched: MStepResult
+) -> MStepResult:
+    """Incremental scan matching with all segments in place, and the closures that place them.
+
+    Args:
+        recording: 2D.
+        e: (M,) P(static) of every beam.
+        options: see SlamOptions.
+        matched: result of incremental scan matching.
+    """
+    starts = matched.diagnostics.breaks
+    if not starts:
+        return matched
+    placed = relocalization.relocalize_segments(
+        _make_context(recording, e, options, matched, starts), starts
+    )
+    diagnostics = dataclasses.replace(
+        matched.diagnostics, breaks=placed.breaks, segments=starts, ambiguous=placed.ambiguous
+    )
+    return dataclasses.replace(
+        matched, poses=placed.context.poses, loops=placed.closures, diagnostics=diagnostics
+    )
 
 
 def close_loops(
@@ -39,12 +64,14 @@ def close_loops(
         recording: 2D.
         e: (M,) P(static) of every beam.
         options: see SlamOptions.
-        odometry: result of incremental scan matching; its grid is not used.
+        odometry: result of incremental scan matching with segments in place; its grid is not used.
         progress: called with the number of scans done and their total.
     """
-    relocalized = _relocalize(recording, e, options, odometry)
-    context, ties = relocalized.context, relocalized.closures
-    chain = loop_candidates.odometry_constraints(context, options.odometry, relocalized.breaks)
+    breaks, ties = odometry.diagnostics.breaks, odometry.loops
+    tied = [t for tie in ties for t in (tie.earlier, tie.later)]
+    starts = odometry.diagnostics.segments
+    context = _make_context(recording, e, options, odometry, starts, tied)
+    chain = loop_candidates.odometry_constraints(context, options.odometry, breaks)
     state = LoopState(context.poses[context.keyframes], found=ties, fitting=ties)
     centers = loop_candidates.view_centers(context)
     for first, last in loop_candidates.split_stages(context):
@@ -55,41 +82,44 @@ def close_loops(
     accepted = accepted_constraints(context.keyframes, found)
     graph = PoseGraph(context.keyframes, poses, [*chain, *accepted])
     graph = align_headings(recording, e, graph, odometry.covariance)
+    stretches = _without_loops(odometry.diagnostics.bare_stretches, found)
     return dataclasses.replace(
         odometry,
         poses=local_map.propagate_corrections(context.poses, context.keyframes, graph.poses),
         loops=found,
         graph=graph,
-        diagnostics=dataclasses.replace(
-            odometry.diagnostics,
-            breaks=relocalized.breaks,
-            ambiguous=relocalized.ambiguous,
-            bare_stretches=_without_loops(odometry.diagnostics.bare_stretches, found),
-        ),
+        diagnostics=dataclasses.replace(odometry.diagnostics, bare_stretches=stretches),
     )
 
 
-def _relocalize(
-    recording: Recording, e: Float32, options: SlamOptions, odometry: MStepResult
-) -> Relocalization:
-    """The trajectory with all segments relocalized."""
-    poses, breaks = odometry.poses, odometry.diagnostics.breaks
+def _make_context(
+    recording: Recording,
+    e: Float32,
+    options: SlamOptions,
+    odometry: MStepResult,
+    breaks: list[int],
+    tied: Sequence[int] = (),
+) -> LoopContext:
+    """The trajectory, cut at breaks; scans that closures tie are keyframes."""
+    poses = odometry.poses
     keyframe_distance = options.keyframe_distance or KEYFRAME_DISTANCE
     search = options.loop_search_distance
     gap = loop_candidates.MIN_LOOP_TRAVEL + 2.0 * loop_verification.SUBMAP_TRAVEL
-    context = LoopContext(
+    selected = local_map.select_keyframes(
+        poses, keyframe_distance, local_map.KEYFRAME_ANGLE, breaks
+    )
+    return LoopContext(
         recording,
         e,
         poses,
         relocalization.separate_segments(local_map.travelled_distance(poses), breaks, gap),
         odometry.explained,
-        local_map.select_keyframes(poses, keyframe_distance, local_map.KEYFRAME_ANGLE, breaks),
+        np.union1d(selected, np.array(tied, np.intp)),
         options.resolution,
         keyframe_distance,
         SEARCH_DISTANCE if search is None else search,
         np.zeros((len(poses), 3, 3)) if odometry.drift is None else odometry.drift,
     )
-    return relocalization.relocalize_segments(context, breaks)
 
 
 def _without_loops(stretches: list[BareStretch], loops: list[LoopClosure]) -> list[BareStretch]:

@@ -10,17 +10,18 @@ import numpy as np
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import se2
-from stillmap.core.array_types import Bool, Float, Float32
+from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, scan_hits, scan_matching
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.lidar_odometry import register_sweeps
 from stillmap.slam.local_map import SCAN_SPACING, select_keyframes_per_sensor
-from stillmap.slam.loop_closure import close_loops
+from stillmap.slam.loop_closure import close_loops, place_segments
 from stillmap.slam.loop_closure_3d import close_loops_3d
 from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, add_scan, thin_scans
+from stillmap.slam.step_alternatives import revise_steps
 from stillmap.slam.types import MStepResult, ScanProgress
 
 _SCANS_PER_CALL = 200  # of the kernel; interrupts are noticed in between
@@ -116,6 +117,7 @@ def m_step(
     *,
     initial: MStepResult | None = None,
     earlier_poses: Float | None = None,
+    earlier: MStepResult | None = None,
     with_grid: bool = True,
     free_space_margin: float = FREE_SPACE_MARGIN,
 ) -> MStepResult:
@@ -130,6 +132,8 @@ def m_step(
         progress: called with the step, the number of scans done and their total.
         initial: an M-step with closed loops: its poses are only refined. 2D only.
         earlier_poses: (T, 3, 3) estimate that is better than odometry for deskewing. 2D only.
+        earlier: an earlier M-step: it is refined, and kept if scans matched anew are less likely.
+            2D only.
         with_grid: whether to compute the sums of (10).
         free_space_margin: m before its end in which a beam is not used as free space; (10) as
             printed has 0.
@@ -142,7 +146,7 @@ def m_step(
     else:
         matched, weights = thin_scans(recording, e) if D == 2 else (recording, e)
         step = _PoseStep(matched, weights, options, threads, progress, free_space_margin)
-        found = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses)
+        found = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses, earlier)
         progress("counting beams", 0, 0)
     if with_grid:
         deskewed = deskew_recording(recording, found.poses, options, threads)
@@ -175,38 +179,74 @@ class _PoseStep:
         poses, loops, graph = close_loops_3d(recording, e, options, odometry, closing, threads)
         return dataclasses.replace(found, poses=poses, loops=loops, graph=graph)
 
-    def estimate_2d(self, initial: MStepResult | None, earlier_poses: Float | None) -> MStepResult:
+    def estimate_2d(
+        self,
+        initial: MStepResult | None,
+        earlier_poses: Float | None,
+        earlier: MStepResult | None,
+    ) -> MStepResult:
         """Scan matching, loop closure and refinement."""
-        refining = self._progress("matching scans")
-        if initial is None or not self.options.loop_closure:
-            found = self._match_scans(earlier_poses)
-            if not self.options.loop_closure:
-                return found
-            closing = self._progress("closing loops")
-            initial = close_loops(self._deskew(found.poses), self.e, self.options, found, closing)
-            refining = self._progress("refining poses")
+        if initial is not None and self.options.loop_closure:
+            return self._refine(initial, self._progress("matching scans"))
+        recording, options = self.recording, self.options
+        motion = recording.T_odom_base if earlier_poses is None else earlier_poses
+        if motion is None and options.deskew and recording.beam_time is not None:
+            motion = self._match_scans(recording, self.e).poses  # skewed scans are good enough
+        deskewed = self._deskew(motion)
+        matched = self._match_scans(deskewed, self.e)
+        if not options.loop_closure:
+            return matched
+        placed = place_segments(self._deskew(matched.poses), self.e, options, matched)
+
+        def match_part(
+            part: Recording, e: Float32, search_wider: bool, faults: Index
+        ) -> MStepResult:
+            return self._part(part, e)._match_scans(part, e, search_wider, faults)
+
+        def finish(scans: Recording, e: Float32, trajectory: MStepResult) -> MStepResult:
+            step = self if scans is deskewed else self._part(scans, e)
+            return step._close_loops(trajectory)
+
+        if earlier is not None:
+            earlier = self._refine(earlier, self._progress("refining poses"))
+        return revise_steps(deskewed, self.e, options, placed, match_part, finish, earlier)
+
+    def _match_scans(
+        self,
+        scans: Recording,
+        e: Float32,
+        search_wider: bool = True,
+        faults: Index | None = None,
+    ) -> MStepResult:
+        """Incremental scan matching."""
+        return register_scans(
+            scans,
+            e,
+            self.options,
+            self._progress("matching scans"),
+            _LOCAL_MAP_TRAVEL if self.options.loop_closure else np.inf,
+            self.free_space_margin,
+            search_wider=search_wider,
+            faults=faults,
+        )
+
+    def _close_loops(self, matched: MStepResult) -> MStepResult:
+        """Loop closure and refinement; scans are deskewed by the best motion estimate so far."""
+        deskewed, closing = self._deskew(matched.poses), self._progress("closing loops")
+        closed = close_loops(deskewed, self.e, self.options, matched, closing)
+        return self._refine(closed, self._progress("refining poses"))
+
+    def _refine(self, initial: MStepResult, progress: ScanProgress) -> MStepResult:
         refined = initial
         for _ in range(_REFINEMENT_PASSES):
             deskewed = self._deskew(refined.poses)
-            refined = refine_poses(deskewed, self.e, self.options, refined, refining)
+            refined = refine_poses(deskewed, self.e, self.options, refined, progress)
         # a misregistered scan agrees with a map that contains it: keep the share from the local map
         return dataclasses.replace(refined, explained=initial.explained)
 
-    def _match_scans(self, earlier_poses: Float | None) -> MStepResult:
-        """Incremental scan matching; scans are deskewed by the best motion estimate so far."""
-        recording, options = self.recording, self.options
-        max_travel = _LOCAL_MAP_TRAVEL if options.loop_closure else np.inf
-        progress = self._progress("matching scans")
-
-        def match(scans: Recording) -> MStepResult:
-            return register_scans(
-                scans, self.e, options, progress, max_travel, self.free_space_margin
-            )
-
-        motion = recording.T_odom_base if earlier_poses is None else earlier_poses
-        if motion is None and options.deskew and recording.beam_time is not None:
-            motion = match(recording).poses  # skewed scans are good enough to estimate the motion
-        return match(self._deskew(motion))
+    def _part(self, scans: Recording, e: Float32) -> "_PoseStep":
+        """The same of some scans, without progress."""
+        return dataclasses.replace(self, recording=scans, e=e, progress=lambda *_: None)
 
     def _deskew(self, poses: Float | None) -> Recording:
         return deskew_recording(self.recording, poses, self.options)

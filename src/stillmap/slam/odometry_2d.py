@@ -3,7 +3,7 @@
 import numpy as np
 
 import stillmap._core as _core
-from stillmap.core.array_types import Float, Float32
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, relocalization
 from stillmap.slam.local_map import LocalMap, travelled_distance
@@ -36,6 +36,9 @@ def register_scans(
     progress: ScanProgress,
     max_travel: float = np.inf,
     free_space_margin: float = FREE_SPACE_MARGIN,
+    *,
+    search_wider: bool = True,
+    faults: Index | None = None,
 ) -> MStepResult:
     """Poses by incremental maximum likelihood.
 
@@ -48,10 +51,16 @@ def register_scans(
         progress: called with the number of scans done and their total.
         max_travel: m of travel after which a scan leaves the local map.
         free_space_margin: m before its end in which a beam is not used as free space.
+        search_wider: whether a scan that does not fit near its prior is searched for.
+        faults: (n,) scans at which odometry fails.
     """
     T = recording.n_scans
     grid = _core.OccupancyGrid2D(options.resolution, free_space_margin)
-    odometry = _ScanOdometry(recording, e, options, max_travel, LocalMap(grid, recording, e))
+    odometry = _ScanOdometry(
+        recording, e, options, max_travel, LocalMap(grid, recording, e), search_wider
+    )
+    if odometry.steps is not None and faults is not None:
+        odometry.steps.plausible[faults - 1] = False
     progress(1, T)
     for t in recording.iter_scans(range(1, T), e):
         odometry.register(t)
@@ -69,10 +78,12 @@ class _ScanOdometry:
         options: SlamOptions,
         max_travel: float,
         local_map: LocalMap,
+        search_wider: bool,
     ) -> None:
         T, odometry = recording.n_scans, recording.T_odom_base
         self.recording, self.e, self.options = recording, e, options
         self.max_travel, self.local_map = max_travel, local_map
+        self.search_wider = search_wider
         self.poses = np.tile(np.eye(3), (T, 1, 1))
         self.covariance, self.explained = np.zeros((T, 3, 3)), np.ones(T)
         self.drift, self.unmeasured = np.zeros((T, 3, 3)), np.zeros(T)
@@ -191,7 +202,7 @@ class _ScanOdometry:
         """
         grid, usual = self.local_map.grid, self.usual[self.recording.sensor[t]]
         step = prior if learned is None else learned
-        if len(scan.points) == 0 or usual == 0.0:
+        if not self.search_wider or len(scan.points) == 0 or usual == 0.0:
             return match, False
         if is_poor(match, usual):
             # one scan that fits somewhere near does not say where the robot went, or was carried,

@@ -20,7 +20,7 @@ from stillmap.slam.scan_hits import NORMALS, Scan
 
 # likelihood field: m, std around end points; value of an unexplained end point; value added in
 # unknown space, which is not free; weight of one beam against the motion prior
-_FIELD_STD, _FLOOR, _UNKNOWN, _INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
+_FIELD_STD, _FLOOR, _UNKNOWN, INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
 _MAX_ITERATIONS = 20  # Newton
 _MAX_SEARCH_RANGE = 20.0  # m; longer beams are left out of the correlative search
 _MAX_CANDIDATES = 3  # poses of the correlative search that are refined
@@ -32,7 +32,7 @@ _LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
 # m, rad: half widths of the wider searches, at least
 _WIDE_WINDOWS = (0.5, 0.5), (1.5, math.pi)
 MIN_GAIN = 7.0  # nats that a pose must gain outside the learned noise of odometry
-_FAULT_COST = -math.log(1e-6)  # nats: odometry fails at a scan, about once a day of driving
+FAULT_COST = -math.log(1e-6)  # nats: odometry fails at a scan, about once a day of driving
 ODOMETRY_FAULT = 10.0  # nats of gain from which odometry is rejected
 # nats that new parts of the world cost at most where odometry leads: a robot that moves on sees
 # them, and buildings repeat, so that a place that is known and alike proves little
@@ -123,7 +123,7 @@ def widen_match(
             continue
         wide = motion_model.widen_prior(mean, *(half / _SEARCH_STDS for half in window))
         wider = _search_window(grid, scan, wide)
-        cost_of_fault = _evidence_cost(wide, wider) + _FAULT_COST
+        cost_of_fault = _evidence_cost(wide, wider) + FAULT_COST
         # at a place that only looks alike, beams would pass through walls
         is_alike = occluded_share(grid, scan, wider.T_map_base) > MAX_OCCLUDED
         if cost_of_fault < cost and not is_alike:
@@ -233,7 +233,7 @@ def _register(
 def _ray_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
     """Nats of the beams that would pass through walls at a pose (3, 3)."""
     occluded = occluded_share(grid, scan, T_map_base) * float(scan.weights.sum(dtype=np.float64))
-    return _INFORMATION_SCALE * _OCCLUDED_COST * occluded
+    return INFORMATION_SCALE * _OCCLUDED_COST * occluded
 
 
 def _excess_of_unknown(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
@@ -247,14 +247,14 @@ def _excess_of_unknown(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Floa
     points, weights = scan.points[is_unknown], scan.weights[is_unknown]
     unknown = dataclasses.replace(scan, points=points, weights=weights)
     hidden = occluded_share(grid, unknown, T_map_base, _NEAR_WALL)
-    per_beam = -_INFORMATION_SCALE * math.log((_FLOOR + _UNKNOWN) / (_FLOOR + 1.0))
+    per_beam = -INFORMATION_SCALE * math.log((_FLOOR + _UNKNOWN) / (_FLOOR + 1.0))
     new = (1.0 - hidden) * float(weights.sum(dtype=np.float64))
     return max(per_beam * new - _MAX_UNKNOWN_COST, 0.0)
 
 
 def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
     """Cost of the beams at a pose (3, 3), nats."""
-    return _INFORMATION_SCALE * _core.registration_cost(
+    return INFORMATION_SCALE * _core.registration_cost(
         grid, scan.points, scan.weights, T_map_base, **_likelihood_field(grid)
     )
 
@@ -267,7 +267,7 @@ def refinement_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
 
 
 def _newton_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
-    scale = {"information_scale": _INFORMATION_SCALE, "max_iterations": _MAX_ITERATIONS}
+    scale = {"information_scale": INFORMATION_SCALE, "max_iterations": _MAX_ITERATIONS}
     return {**_likelihood_field(grid), **scale}
 
 

@@ -88,6 +88,7 @@ class Diagnostics(ShortRepr):
         odometry_faults: odometry was rejected.
         breaks: first scans after the robot was carried elsewhere; before loop closure, those
             before which it may have been.
+        segments: first scans of all segments that were placed, those that follow by odometry too.
         ambiguous: first scans of segments that contradict the map where odometry leads, or fit
             another place about as well.
         bare_stretches: whose length the scans do not show, and no accepted loop measures.
@@ -96,6 +97,7 @@ class Diagnostics(ShortRepr):
     widened: list[int] = field(default_factory=list)
     odometry_faults: list[int] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
+    segments: list[int] = field(default_factory=list)
     ambiguous: list[int] = field(default_factory=list)
     bare_stretches: list[BareStretch] = field(default_factory=list)
 

@@ -1,0 +1,335 @@
+"""Alternatives to steps of incremental scan matching, compared by the evidence of their maps.
+
+Scan matching decides at each scan, before it sees where that leads. Where it found a scan outside
+odometry's prior, three hypotheses may explain the scans around it better: that odometry was right,
+that it failed at these scans only, or that it failed throughout. The one is taken whose map has the
+higher marginal likelihood. Beams that end in free space or pass through walls lower it; so does
+every new cell, and a place that is mapped twice.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+import stillmap._core as _core
+from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Index
+from stillmap.core.recording import Recording
+from stillmap.slam import local_map, motion_model, scan_hits
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
+from stillmap.slam.types import MStepResult
+
+# prior Beta(a, b) of the occupancy of a cell: most cells are free, few are anything in between
+_PRIOR = 0.1, 0.5
+# m of travel and scans on both sides, at least: that are matched again, and that are compared, as
+# far as the local map reaches
+_MATCHED_AGAIN, _COMPARED = (10.0, 8), (25.0, 10)
+# scans over which two motions are compared; m and rad from which they differ
+_SPAN, _SAME = 3, np.array([0.1, 0.05])
+
+# scan matching of a recording given e (M,), with or without a wider search, and scans at which
+# odometry fails; and the same with loops closed
+Register = Callable[[Recording, Float32, bool, Index], MStepResult]
+Finish = Callable[[Recording, Float32, MStepResult], MStepResult]
+
+
+@dataclass(frozen=True, eq=False)
+class _Alternative:
+    """Other steps to the scans from a to b - 1.
+
+    Attributes:
+        steps: of the scans from `offset` on.
+        gain: nats by which they are more likely, as the scans around them show.
+    """
+
+    steps: MStepResult
+    offset: int
+    a: int
+    b: int
+    gain: float = 0.0
+
+    def replace_in(self, matched: MStepResult) -> MStepResult:
+        """The trajectory with these steps; what follows moves along as a whole."""
+        inside, after = slice(self.a, self.b), slice(self.b, None)
+        of_steps = slice(self.a - self.offset, self.b - self.offset)
+        P, Q, last = matched.poses, self.steps.poses, self.b - 1
+        C = P[self.a - 1] @ se2.inverse(Q[of_steps.start - 1])
+        poses = P.copy()
+        poses[inside] = C @ Q[of_steps]
+        C_after = poses[last] @ se2.inverse(P[last])
+        poses[after] = C_after @ P[after]
+        arrays = {}
+        for name in ("covariance", "drift"):
+            values = getattr(matched, name).copy()
+            values[inside] = se2.rotate_covariance(getattr(self.steps, name)[of_steps], C)
+            values[after] = se2.rotate_covariance(values[after], C_after)
+            arrays[name] = values
+        explained = matched.explained.copy()
+        explained[inside] = self.steps.explained[of_steps]
+        scans = {
+            name: self._replace_scans(matched, name) for name in ("widened", "odometry_faults")
+        }
+        diagnostics = dataclasses.replace(matched.diagnostics, **scans)
+        return dataclasses.replace(
+            matched,
+            poses=se2.normalize(poses),
+            explained=explained,
+            diagnostics=diagnostics,
+            **arrays,
+        )
+
+    def _replace_scans(self, matched: MStepResult, name: str) -> list[int]:
+        kept = [t for t in getattr(matched.diagnostics, name) if not self.a <= t < self.b]
+        of_steps = [t + self.offset for t in getattr(self.steps.diagnostics, name)]
+        return sorted(kept + [t for t in of_steps if self.a <= t < self.b])
+
+    def overlaps(self, other: "_Alternative") -> bool:
+        """True if both replace the same step."""
+        return self.a < other.b and other.a < self.b
+
+
+class _Choice(NamedTuple):
+    """A trajectory, the same with loops closed, and its cost in nats."""
+
+    matched: MStepResult
+    finished: MStepResult
+    cost: float
+
+
+def revise_steps(
+    recording: Recording,
+    e: Float32,
+    options: SlamOptions,
+    matched: MStepResult,
+    register: Register,
+    finish: Finish,
+    earlier: MStepResult | None = None,
+) -> MStepResult:
+    """The most likely trajectory, with loops closed.
+
+    Args:
+        recording: 2D, deskewed.
+        e: (M,) P(static) of every beam.
+        options: see SlamOptions.
+        matched: result of incremental scan matching, with segments in place.
+        register: scan matching of a part of the recording.
+        finish: closes loops.
+        earlier: trajectory of an earlier iteration, which is kept if it is more likely than
+            `matched`: an M-step does not lower the likelihood.
+    """
+    finished = finish(recording, e, matched)
+    comparison = _Comparison(recording, e, options, matched, finish)
+    best = _Choice(matched, finished, comparison.cost(finished))
+    if earlier is not None and comparison.cost(earlier) < best.cost:
+        return earlier
+    changed = np.ones(recording.n_scans, np.bool_)
+    while alternatives := comparison.propose(best.matched, register, changed):
+        before, best = best.matched, comparison.choose(best, alternatives)
+        changed = comparison.around(_changed_steps(before, best.matched))
+    return best.finished
+
+
+class _Comparison:
+    """Compares trajectories of a recording; arguments as of `revise_steps`."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        e: Float32,
+        options: SlamOptions,
+        matched: MStepResult,
+        finish: Finish,
+    ) -> None:
+        self.recording, self.e, self.options, self.finish = recording, e, options, finish
+        self.travelled = local_map.travelled_distance(matched.poses)
+        self.kept = local_map.select_keyframes_per_sensor(
+            matched.poses, recording.sensor, local_map.SCAN_SPACING, local_map.SCAN_SPACING
+        )
+        self.increments: Float | None = None
+        if recording.T_odom_base is not None:
+            self.increments = _steps(recording.T_odom_base)
+            noise, _ = motion_model.fit_odometry_noise(
+                self.increments, _steps(matched.poses), options.odometry
+            )
+            self.std = motion_model.increment_std(self.increments, options.odometry, noise)
+
+    def choose(self, best: _Choice, alternatives: list[_Alternative]) -> _Choice:
+        """The more likely of a trajectory and the same with alternatives: all of them, or parts."""
+        matched = best.matched
+        for alternative in alternatives:
+            matched = alternative.replace_in(matched)
+        finished = self.finish(self.recording, self.e, matched)
+        cost = self.cost(finished)
+        if cost < best.cost:
+            return _Choice(matched, finished, cost)
+        if len(alternatives) == 1:
+            return best
+        half = len(alternatives) // 2
+        return self.choose(self.choose(best, alternatives[:half]), alternatives[half:])
+
+    def propose(
+        self, matched: MStepResult, register: Register, changed: Bool
+    ) -> list[_Alternative]:
+        """Alternatives that the scans around them make more likely, in the order of the scans.
+
+        Args:
+            matched: the trajectory.
+            register: as of `revise_steps`.
+            changed: (T,) scans that did not lie so before: elsewhere nothing new is to be found.
+        """
+        proposed = [
+            dataclasses.replace(alternative, gain=gain)
+            for alternative in self._match_again(matched, register, changed)
+            if (gain := self._gain(matched, alternative)) > 0.0
+        ]
+        chosen: list[_Alternative] = []
+        for alternative in sorted(proposed, key=lambda proposal: -proposal.gain):
+            if not any(alternative.overlaps(earlier) for earlier in chosen):
+                chosen.append(alternative)
+        return sorted(chosen, key=lambda alternative: alternative.a)
+
+    def around(self, scans: Bool) -> Bool:
+        """(T,) scans in windows around some of the scans (T,)."""
+        out = np.zeros_like(scans)
+        for t in np.flatnonzero(scans).tolist():
+            out[slice(*_window(self.travelled, t, t + 1, _COMPARED))] = True
+        return out
+
+    def _match_again(
+        self, matched: MStepResult, register: Register, changed: Bool
+    ) -> Iterator[_Alternative]:
+        """Steps that differ if odometry is right, fails at scans found far off, or throughout."""
+        widened = np.array(matched.diagnostics.widened, np.intp)
+        rejected = np.union1d(widened, np.array(matched.diagnostics.odometry_faults, np.intp))
+        for is_wide, without_odometry in ((False, False), (True, False), (True, True)):
+            if is_wide and self.increments is None:
+                return
+            at = rejected if without_odometry else widened
+            at = at[changed[at]]
+            for first, last in _windows(self.travelled, at):
+                part, e = self._select(first, last)
+                faults = widened[(first < widened) & (widened < last)] - first
+                source = part.without_odometry() if without_odometry else part
+                steps = register(source, e, is_wide, faults if is_wide else faults[:0])
+                for a, b in _differences(matched.poses[first:last], steps.poses):
+                    # whether the robot was carried is decided where segments are placed
+                    if not any(a <= t < b for t in steps.diagnostics.breaks):
+                        yield _Alternative(steps, first, first + a, first + b)
+
+    def _gain(self, matched: MStepResult, alternative: _Alternative) -> float:
+        """Nats by which the steps of an alternative and the scans around them are more likely."""
+        first, last = _window(self.travelled, alternative.a, alternative.b, _COMPARED)
+        cuts = [t for t in matched.diagnostics.breaks if first < t < last]
+        costs = []
+        for trajectory in (matched, alternative.replace_in(matched)):
+            cost = self._motion_cost(trajectory.poses, alternative.a, alternative.b)
+            for start, end in zip([first, *cuts], [*cuts, last], strict=True):
+                cost += self._scan_cost(self._finish_part(trajectory, start, end), start)
+            costs.append(cost)
+        return costs[0] - costs[1]
+
+    def cost(self, finished: MStepResult) -> float:
+        """Nats, -ln of the probability of all scans and steps, up to a constant."""
+        poses = finished.poses
+        return self._motion_cost(poses, 1, len(poses)) + self._scan_cost(poses, 0)
+
+    def _scan_cost(self, poses: Float, first: int) -> float:
+        """-ln of the marginal likelihood of spaced scans from `first` on at poses (n, 3, 3)."""
+        grid = _core.OccupancyGrid2D(self.options.resolution, moments=False)
+        within = np.searchsorted(self.kept, [first, first + len(poses)])
+        for t in self.recording.iter_scans(self.kept[slice(*within)], self.e):
+            beams = self.recording.beams_of(t)
+            points, hit = self.recording.points[beams], self.recording.hit[beams]
+            T = poses[t - first] @ self.recording.T_base_sensor[self.recording.sensor[t]]
+            _core.add_beams(grid, points, hit, self.e[beams], np.array([0, len(hit)]), T[None])
+        return -INFORMATION_SCALE * grid.log_evidence(*_PRIOR)
+
+    def _motion_cost(self, poses: Float, a: int, b: int) -> float:
+        """-ln of the probability of the steps to a to b - 1 given odometry, which may fail."""
+        if self.increments is None:
+            return 0.0
+        steps, std = slice(a - 1, b - 1), self.std[a - 1 : b - 1]
+        residual = se2.inverse(self.increments[steps]) @ _steps(poses[a - 1 : b])
+        d = se2.parameters(residual) / std[:, [0, 0, 1]]
+        return float(np.minimum(0.5 * (d**2).sum(axis=1), FAULT_COST).sum())
+
+    def _finish_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
+        """Poses of the scans from first to last - 1 with the loops among them closed."""
+        part, e = self._select(first, last)
+        scans = slice(first, last)
+        drift = None if trajectory.drift is None else trajectory.drift[scans]
+        matched = MStepResult(
+            trajectory.poses[scans],
+            trajectory.covariance[scans],
+            trajectory.grid,
+            trajectory.explained[scans],
+            drift,
+        )
+        return self.finish(part, e, matched).poses
+
+    def _select(self, first: int, last: int) -> tuple[Recording, Float32]:
+        """The scans from first to last - 1 and the e of their beams."""
+        recording, scans = self.recording, np.arange(first, last)
+        beams = [np.arange(*recording.offset[t : t + 2]) for t in scans.tolist()]
+        odometry = None if recording.T_odom_base is None else recording.T_odom_base[scans]
+        part = scan_hits.select_beams(recording, scans, beams, odometry)
+        return part, self.e[recording.offset[first] : recording.offset[last]]
+
+
+def _steps(poses: Float) -> Float:
+    """(T - 1, 3, 3) motions between successive poses."""
+    return se2.inverse(poses[:-1]) @ poses[1:]
+
+
+def _changed_steps(before: MStepResult, after: MStepResult) -> Bool:
+    """(T,) scans whose step differs."""
+    differs = _differ(_steps(before.poses), _steps(after.poses))
+    return np.append(False, differs)
+
+
+def _windows(travelled: Float, at: Index) -> list[tuple[int, int]]:
+    """Windows around scans, first scan and one after the last; those that touch are merged."""
+    out: list[tuple[int, int]] = []
+    for t in at.tolist():
+        first, last = _window(travelled, t, t + 1, _MATCHED_AGAIN)
+        if out and first <= out[-1][1]:
+            first, _ = out.pop()
+        out.append((first, last))
+    return out
+
+
+def _window(travelled: Float, a: int, b: int, size: tuple[float, int]) -> tuple[int, int]:
+    """The scans around a to b - 1: the first, and one after the last."""
+    metres, scans = size
+    ends = travelled[a] - metres, travelled[b - 1] + metres
+    first, last = np.searchsorted(travelled, ends).tolist()
+    return max(min(first, a - scans), 0), min(max(last, b + scans), len(travelled))
+
+
+def _differences(P: Float, Q: Float) -> list[tuple[int, int]]:
+    """Stretches in which the motions of poses P, Q (n, 3, 3) differ: first scan, one after last."""
+    differs = np.zeros(len(P), np.bool_)
+    for span in range(1, min(_SPAN, len(P) - 1) + 1):
+        far = _differ(se2.inverse(P[:-span]) @ P[span:], se2.inverse(Q[:-span]) @ Q[span:])
+        for k in range(1, span + 1):
+            differs[k : len(P) - span + k] |= far
+    at = np.flatnonzero(differs)
+    parts = np.split(at, np.flatnonzero(np.diff(at) > _SPAN) + 1) if len(at) else []
+    # a scan that lies askew between two that do not moves nothing after it
+    ends = [(int(part[0]) - 1, int(part[-1])) for part in parts]
+    return [
+        (a + 1, b + 1)
+        for a, b in ends
+        if _differ(se2.inverse(P[a]) @ P[b], se2.inverse(Q[a]) @ Q[b])
+    ]
+
+
+def _differ(p: Float, q: Float) -> Bool:
+    """(...,) whether motions (..., 3, 3) differ."""
+    d = np.abs(se2.parameters(se2.inverse(p) @ q))
+    differs: Bool = (np.hypot(d[..., 0], d[..., 1]) > _SAME[0]) | (d[..., 2] > _SAME[1])
+    return differs
