@@ -70,10 +70,11 @@ class _Alternative:
             arrays[name] = values
         explained = matched.explained.copy()
         explained[inside] = self.steps.explained[of_steps]
-        scans = {
-            name: self._replace_scans(matched, name) for name in ("widened", "odometry_faults")
-        }
-        diagnostics = dataclasses.replace(matched.diagnostics, **scans)
+        diagnostics = dataclasses.replace(
+            matched.diagnostics,
+            widened=self._replace_scans(matched, "widened"),
+            odometry_faults=self._replace_scans(matched, "odometry_faults"),
+        )
         return dataclasses.replace(
             matched,
             poses=se2.normalize(poses),
