@@ -110,7 +110,7 @@ def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str
 
 def _step_lengths(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(T-1,) distances, m, and rotations, degrees, between consecutive poses."""
-    step = se2.inverse(T[:-1]) @ T[1:]
+    step = se2.increments(T)
     # the angle of a rotation in any dimension follows from its trace
     trace = np.trace(step[:, :-1, :-1], axis1=1, axis2=2)
     cosine = trace / 2.0 if T.shape[-1] == 3 else (trace - 1.0) / 2.0

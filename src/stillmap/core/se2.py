@@ -41,6 +41,12 @@ def inverse(T: Float) -> Float:
     return out
 
 
+def increments(T: Float) -> Float:
+    """Motions (n - 1, D + 1, D + 1) between successive poses (n, D + 1, D + 1)."""
+    out: Float = inverse(T[:-1]) @ T[1:]
+    return out
+
+
 def log(T: Float) -> Float:
     """(..., 3) twists x, y, theta of transforms (..., 3, 3): constant motion along an arc."""
     x, y, theta = np.moveaxis(parameters(T), -1, 0)

@@ -11,9 +11,9 @@ import numpy as np
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float
+from stillmap.live.slip_detection import SlipDetector
 from stillmap.slam import motion_model, relocalization
 from stillmap.slam.motion_model import MotionPrior, gaussian_prior
-from stillmap.slam.odometry_faults import SlipDetector
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import Scan

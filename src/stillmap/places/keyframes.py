@@ -170,7 +170,7 @@ def _progress(
     stamp_ns: Int64, poses: Float, metres: float, radians: float, seconds: float
 ) -> Float:
     """(T,) sum of travel, turn and time up to each scan, in units of the spacing."""
-    steps = se2.inverse(poses[:-1]) @ poses[1:]
+    steps = se2.increments(poses)
     travel = np.linalg.norm(steps[:, :-1, -1], axis=1)
     if poses.shape[-1] == 3:
         turn = np.abs(se2.parameters(steps)[:, 2])

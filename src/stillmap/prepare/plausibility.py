@@ -220,7 +220,7 @@ def _find_late_intervals(seconds: Float, T_odom_base: Float, n: int) -> Index:
     if len(first) == 0:
         return first
     dt = np.diff(seconds).clip(_MIN_DURATION)
-    velocity = se2.log(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]) / dt[:, None]
+    velocity = se2.log(se2.increments(T_odom_base)) / dt[:, None]
     before, after = velocity[first - 1], velocity[first + n]
     usual = 0.5 * (before + after)
     duration = (seconds[first + n] - seconds[first]).clip(_MIN_DURATION)

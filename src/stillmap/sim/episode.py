@@ -139,7 +139,7 @@ def simulate_odometry(
     Fox, Probabilistic Robotics, 5.4, with random-walk scaling). A slipping wheel rolls farther than
     the robot moves, on short parts of the path. At last come the factors on distance and rotation.
     """
-    x, y, turn = se2.parameters(se2.inverse(T_world_base[:-1]) @ T_world_base[1:]).T
+    x, y, turn = se2.parameters(se2.increments(T_world_base)).T
     # an arc as chord at half its angle
     along = x * np.cos(turn / 2) + y * np.sin(turn / 2)
     distance = along / np.maximum(np.sinc(turn / (2 * np.pi)), 1e-3)
@@ -181,7 +181,7 @@ def add_faults(
         rng: of the times.
     """
     if options.stall_rate > 0:
-        moves = se2.parameters(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:])
+        moves = se2.parameters(se2.increments(T_odom_base))
         moves[_stalls(seconds, options, rng)] = 0.0
         T_odom_base = _chain(moves)
     count = min(options.resets, len(T_odom_base) - 1)

@@ -84,7 +84,7 @@ def _base_twists_3d(stamp_ns: Int64, poses: Float) -> Float:
     seconds = 1e-9 * np.diff(stamp_ns)
     if not len(seconds):
         return np.zeros((len(poses), 6))
-    steps = se3.log(se2.inverse(poses[:-1]) @ poses[1:])
+    steps = se3.log(se2.increments(poses))
     twists = steps / np.where(seconds > 0.0, seconds, np.inf)[:, None]
     leaps = np.linalg.norm(twists[:, :3], axis=1) > MAX_SPEED
     leaps |= np.linalg.norm(twists[:, 3:], axis=1) > MAX_TURN_RATE

@@ -81,7 +81,7 @@ def correct_odometry(
         T = _interpolate(seconds, T, seconds + latency)
     if scale == 1.0 and rotation_gain == 1.0:
         return T
-    twists = se2.log(se2.inverse(T[:-1]) @ T[1:]) / [scale, scale, rotation_gain]
+    twists = se2.log(se2.increments(T)) / [scale, scale, rotation_gain]
     return _chain(T[0], twists)
 
 

@@ -51,11 +51,6 @@ class LocalMap:
         while self._kept and self._kept[0][2] < travelled:
             self._remove(*self._kept.popleft())
 
-    def remove_since(self, t: int) -> None:
-        """Removes scan t and later ones."""
-        while self._kept and self._kept[-1][0] >= t:
-            self._remove(*self._kept.pop())
-
     def _remove(self, t: int, T_map_base: Float, _: float) -> None:
         add_scan(self.grid, self._recording, self._e, t, T_map_base, remove=True)
 

@@ -197,8 +197,8 @@ def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) ->
     leaps = np.zeros((len(poses), 3))
     if recording.T_odom_base is None:
         return leaps
-    increments = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
-    found = se2.inverse(poses[:-1]) @ poses[1:]
+    increments = se2.increments(recording.T_odom_base)
+    found = se2.increments(poses)
     difference = se2.parameters(se2.inverse(increments) @ found)
     std = motion_model.increment_std(increments, options)[:, [0, 0, 1]]
     is_leap = np.linalg.norm(difference / std, axis=1) > _LEAP_STDS

@@ -123,7 +123,7 @@ class SweepLoopCloser:
     def odometry_constraints(self) -> list[Constraint]:
         """Constraints between successive keyframes: a random walk."""
         poses = self.odometry.poses[self.keyframes]
-        steps = se2.inverse(poses[:-1]) @ poses[1:]
+        steps = se2.increments(poses)
         metres = np.diff(self.travelled[self.keyframes]) + 0.05  # standing still has errors too
         covariance = np.diag(np.square([_STEP_TRANSLATION] * 3 + [_STEP_ROTATION] * 3))
         return [

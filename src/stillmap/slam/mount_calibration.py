@@ -317,7 +317,7 @@ def _windows(recording: Recording, poses: Float, laser: int) -> MotionWindows:
     assert recording.T_odom_base is not None
     scans = np.flatnonzero(recording.sensor == laser)
     odometry = recording.T_odom_base[scans]
-    x, y, turn = np.abs(se2.parameters(se2.inverse(odometry[:-1]) @ odometry[1:])).T
+    x, y, turn = np.abs(se2.parameters(se2.increments(odometry))).T
     ends, since = [0], 0.0
     for k, step in enumerate((np.hypot(x, y) + turn).tolist(), start=1):
         since += step

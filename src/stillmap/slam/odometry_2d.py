@@ -8,7 +8,6 @@ from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, relocalization
 from stillmap.slam.local_map import LocalMap, travelled_distance
 from stillmap.slam.motion_model import MotionPrior, VelocityNoise
-from stillmap.slam.odometry_faults import SlipDetector, SlipHypothesis
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, Scan, select_hits
@@ -23,7 +22,6 @@ from stillmap.slam.scan_matching import (
 from stillmap.slam.types import BareStretch, Diagnostics, MStepResult, ScanProgress
 
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-_SURE_GAIN = 40.0  # nats of a pose outside the prior, from which one scan is enough
 # featureless stretches: m, from which a step is hardly measured; scans that are measured within one
 # of them; m, std of the length from which one is named
 _MIN_STEP_STD, _MAX_GAP, _MIN_STD = 0.04, 10, 0.3
@@ -94,7 +92,6 @@ class _ScanOdometry:
             if odometry is None
             else motion_model.compute_odometry_steps(odometry, recording.stamp_ns)
         )
-        self.slip = SlipDetector(None if self.steps is None else self.steps.increments)
         self.noise = VelocityNoise()
         self.odometry_noise = motion_model.OdometryNoise()
         self.seconds_before = np.append(0.0, 1e-9 * np.diff(recording.stamp_ns))
@@ -108,21 +105,17 @@ class _ScanOdometry:
 
     def register(self, t: int) -> None:
         """Matches scan t and adds it to the local map."""
-        last, guess = self.poses[t - 1], self._predict(t)
-        prior, alternative = self._priors(t, guess, self.slip.is_slipping(t, last, guess))
+        guess = self._predict(t)
+        prior, alternative = self._priors(t, guess)
         scan, s = select_hits(self.recording, self.e, t), self.recording.sensor[t]
         # without odometry, the first scan of a sensor with another view has nothing to match
         has_map = prior.is_odometry or self.local_map.has_sensor(s)
-        learned = self._learned_prior(t, prior, guess)
+        learned = self._learned_prior(t, prior)
         if has_map:
             match = match_scan(self.local_map.grid, scan, prior, self.usual[s], learned)
         else:
             match = accept_prior(prior)
         match, contradicts = self._resolve_poor_match(t, scan, match, prior, alternative, learned)
-        slip = self.slip.detect(t, last, guess, self.local_map.grid, scan, match)
-        if slip is not None:
-            match = self._accept_slip(t, slip)
-            guess = self._predict(t)
         self._record(t, match, is_fault=self._rejects_odometry(t, prior, alternative, match))
         self.drift[t] = motion_model.blind_drift(learned or prior, match.covariance)
         self.unmeasured[t] = motion_model.unmeasured_variance(
@@ -141,15 +134,13 @@ class _ScanOdometry:
             self.local_map.add(t, match.T_map_base, self.travelled)
         self.local_map.remove_before(self.travelled - self.max_travel)
 
-    def _learned_prior(self, t: int, prior: MotionPrior, guess: MotionPrior) -> MotionPrior | None:
+    def _learned_prior(self, t: int, prior: MotionPrior) -> MotionPrior | None:
         """The odometry prior of scan t with the noise learned so far; None: use `prior`."""
-        last = self.poses[t - 1]
-        # odometry that stops at once may have stalled
-        has_stopped = self.slip.stands_still(t, last, guess.T_map_base)
-        if self.steps is None or not prior.is_odometry or has_stopped:
+        if self.steps is None or not prior.is_odometry:
             return None
+        increment = self.steps.increments[t - 1]
         return motion_model.odometry_prior(
-            last, self.steps.increments[t - 1], self.options.odometry, self.odometry_noise
+            self.poses[t - 1], increment, self.options.odometry, self.odometry_noise
         )
 
     def _predict(self, t: int) -> MotionPrior:
@@ -159,16 +150,13 @@ class _ScanOdometry:
             self.poses[t - 1], self.poses[before], self.noise
         )
 
-    def _priors(
-        self, t: int, guess: MotionPrior, is_slipping: bool
-    ) -> tuple[MotionPrior, MotionPrior | None]:
+    def _priors(self, t: int, guess: MotionPrior) -> tuple[MotionPrior, MotionPrior | None]:
         """The prior of scan t and the alternative to it: odometry and prediction."""
         if self.steps is None:
             return guess, None
         increment = self.steps.increments[t - 1]
         measured = motion_model.odometry_prior(self.poses[t - 1], increment, self.options.odometry)
-        is_valid = self.steps.plausible[t - 1] and not is_slipping
-        return (measured, guess) if is_valid else (guess, measured)
+        return (measured, guess) if self.steps.plausible[t - 1] else (guess, measured)
 
     def _rejects_odometry(
         self, t: int, prior: MotionPrior, alternative: MotionPrior | None, match: ScanMatch
@@ -177,15 +165,6 @@ class _ScanOdometry:
         if self.steps is None or prior.is_odometry or alternative is None:
             return False
         return not self.steps.plausible[t - 1] or is_inconsistent(alternative, match.T_map_base)
-
-    def _accept_slip(self, t: int, slip: SlipHypothesis) -> ScanMatch:
-        """Replaces the poses since odometry stopped; returns the match of scan t."""
-        # the scans are not added again: those to come show the same
-        self.local_map.remove_since(slip.first)
-        for k, match in enumerate(slip.matches, slip.first):
-            self._record(k, match, is_fault=True)
-        self.travelled += _length(self.poses[slip.first - 1 : t])
-        return slip.matches[-1]
 
     def _resolve_poor_match(
         self,
@@ -211,8 +190,7 @@ class _ScanOdometry:
             if relocalization.is_gap(seconds, self.seconds, step.translation_std):
                 return self._start_segment(t, step), False
             wider = widen_match(grid, scan, prior, alternative, match, usual)
-            is_sure = match.cost - wider.cost > _SURE_GAIN
-            if wider.widened and (is_sure or self._is_consistent_ahead(t, wider, usual)):
+            if wider.widened:
                 return wider, False
         if not is_poor(match, usual):
             return match, False
@@ -230,7 +208,6 @@ class _ScanOdometry:
         self.breaks.append(t)
         self.usual[:] = 0.0
         self.local_map.clear()
-        self.slip.reset()
         return accept_prior(prior)
 
     def _is_consistent_ahead(self, t: int, match: ScanMatch, usual: float) -> bool:

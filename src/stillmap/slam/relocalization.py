@@ -68,8 +68,8 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         segment = Segment(context, first, last, covariance)
         previous, is_placed, C = first, True, np.eye(3)
         here = segment.follow_odometry()
-        there = None if here.is_supported else segment.find_place()
-        if here.is_supported:
+        there = None if here.is_verified else segment.find_place()
+        if here.is_verified:
             C = here.C
         elif there is not None and there.score > max(here.score, 0.0):
             C = there.C

@@ -33,7 +33,6 @@ _LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
 _WIDE_WINDOWS = (0.5, 0.5), (1.5, math.pi)
 MIN_GAIN = 7.0  # nats that a pose must gain outside the learned noise of odometry
 FAULT_COST = -math.log(1e-6)  # nats: odometry fails at a scan, about once a day of driving
-ODOMETRY_FAULT = 10.0  # nats of gain from which odometry is rejected
 # nats that new parts of the world cost at most where odometry leads: a robot that moves on sees
 # them, and buildings repeat, so that a place that is known and alike proves little
 _MAX_UNKNOWN_COST = 14.0

@@ -264,7 +264,7 @@ def _search_windows(recording: Recording, scans: Index) -> tuple[Float, Float]:
     odometry = recording.T_odom_base
     assert odometry is not None
     stamps = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
-    x, y, turn = np.abs(se2.parameters(se2.inverse(odometry[:-1]) @ odometry[1:])).T
+    x, y, turn = np.abs(se2.parameters(se2.increments(odometry))).T
     travelled = np.concatenate([[0.0], np.hypot(x, y).cumsum()])
     turned = np.concatenate([[0.0], turn.cumsum()])
     lateness = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None] * _MAX_LATENESS

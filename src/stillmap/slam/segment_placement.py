@@ -53,7 +53,7 @@ class Placement:
         return self.fitting - _CONTRADICTION_WEIGHT * self.contradicting - self.cost
 
     @property
-    def is_supported(self) -> bool:
+    def is_verified(self) -> bool:
         """True if enough keyframes fit, and outweigh those that contradict."""
         return self.fitting >= _MIN_SUPPORT and self.score >= 0
 
@@ -96,7 +96,7 @@ class Segment:
             placement = self._follow(self._motion(closure), closure.later, np.zeros((3, 3)))
             cost = min(self._cost(placement.C), _cost_of_carrying(placement.tested))
             placement = dataclasses.replace(placement, cost=cost)
-            if placement.is_supported and (best is None or placement.score > best.score):
+            if placement.is_verified and (best is None or placement.score > best.score):
                 best = placement
         if best is None:
             return None
