@@ -74,17 +74,6 @@ def test_good_poses_are_kept(recording):
     assert compare(worse, state_after(worse, recording.T_odom_base)) is None
 
 
-def test_scans_alone_are_tried_where_odometry_is_often_at_fault(recording):
-    rng = np.random.default_rng(0)
-    jumps = se2.matrix(*(rng.normal(size=(3, recording.n_scans)) * [[0.5], [0.5], [0.3]]))
-    jumpy = dataclasses.replace(recording, T_odom_base=recording.T_odom_base @ jumps)
-    poses = bent(recording.T_odom_base, 2.0)
-    assert compare(jumpy, state_after(jumpy, poses)) is None
-    found = compare(jumpy, state_after(jumpy, poses, odometry_faults=list(range(1, 31))))
-    assert found.record.source == "scans"
-    assert compute_absolute_errors(found.estimate.poses, recording.T_odom_base).rmse < 0.03
-
-
 def lagging(poses, first, last, share):
     """Poses that move by a share of the way only in some of the steps."""
     steps = se2.inverse(poses[:-1]) @ poses[1:]

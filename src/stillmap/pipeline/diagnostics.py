@@ -65,7 +65,6 @@ def _input_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
 
 _SOURCES = {
     "odometry": "odometry alone",
-    "scans": "scan matching without odometry",
     "odometry_in_stretches": "odometry in stretches that scan matching measured otherwise",
 }
 

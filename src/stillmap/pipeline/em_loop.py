@@ -84,8 +84,8 @@ class IterationRecord:
         seconds: wall clock.
         held_out_log_likelihood: nats per beam of scans left out of the map; None: not computed.
         touched_share: share of the scans that the next M-step may match differently.
-        source: "odometry" or "scans" if the poses are those of that source alone,
-            "odometry_in_stretches" if labels were estimated with it in stretches; else empty.
+        source: "odometry" if the poses are those of odometry, "odometry_in_stretches" if labels
+            were estimated with it in stretches; else empty.
     """
 
     number: int

@@ -1,8 +1,8 @@
-"""Poses compared with their sources: odometry alone, or in stretches, and scans alone.
+"""Poses compared with those of odometry, alone or in stretches.
 
 EM starts from odometry and improves on it scan by scan. Where most of what the robot sees is people
-it may end farther from the truth than odometry was, and odometry that is often at fault may do
-harm. Held-out scans tell: they are predicted by the map of the other scans (`em.quality`).
+it may end farther from the truth than odometry was. Held-out scans tell: they are predicted by the
+map of the other scans (`em.quality`).
 """
 
 import dataclasses
@@ -27,7 +27,6 @@ _MAX_SHORTFALL = 0.4
 # likewise in stretches, before the scans are matched with the labels found there
 _MAX_STRETCH_SHORTFALL = 0.15
 _STRETCHES, _SAME_SCORE = "odometry_in_stretches", 0.01
-_MIN_FAULT_SHARE = 0.05  # of the scans at which odometry is at fault: scans alone are worth a try
 
 
 def better_source(
@@ -35,7 +34,7 @@ def better_source(
 ) -> Iteration | None:
     """The source of poses that predicts held-out scans best, if better than the best iteration.
 
-    Sources are odometry alone, scans alone, and scan matching after labels were estimated with
+    Sources are odometry alone, and scan matching after labels were estimated with
     the motion of odometry in the stretches in which both differ.
 
     Args:
@@ -92,10 +91,6 @@ def _sources(
     if alone is not None and alone > score - _MAX_SHORTFALL * abs(score):
         yield "odometry", best.p_static, _keep_poses(odometry, options)
     diagnostics = best.m_step.diagnostics
-    n_faults = len(diagnostics.odometry_faults) + len(diagnostics.breaks)
-    if n_faults > _MIN_FAULT_SHARE * recording.n_scans:
-        bare, e = recording.without_odometry(), best.p_static
-        yield "scans", e, _match_scans(bare, e, best.poses, state, progress, stages)
     mixed = replace_stretches(
         best.poses, recording.T_odom_base, recording.stamp_ns, diagnostics, options.slam.odometry
     )
