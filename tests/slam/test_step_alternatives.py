@@ -55,8 +55,7 @@ def test_a_wrong_step_is_replaced(monkeypatch, offset):
     found = slam.m_step(recording, prior(recording), options, None, 1, lambda *_: None)
     assert ate(found, simulation.truth) < 0.02
     assert found.diagnostics.widened == []
-    assert calls[0] == recording.n_scans
-    assert all(n <= recording.n_scans for n in calls[1:])
+    assert len(calls) > 1
 
 
 def test_steps_in_no_trouble_are_not_matched_again(monkeypatch):
@@ -90,12 +89,19 @@ def test_windows_and_differences():
 
 def test_odometry_may_be_said_to_fail():
     recording = room(40).recording
-    e, options = prior(recording), slam.SlamOptions()
-    wrong = recording.T_odom_base.copy()
-    wrong[20:] = wrong[19] @ se2.matrix(0.3, 0.0, 0.2) @ se2.inverse(wrong[19]) @ wrong[20:]
-    recording = dataclasses.replace(recording, T_odom_base=wrong)
-    found = odometry_2d.register_scans(recording, e, options, silent, faults=np.array([20]))
-    assert 20 in found.diagnostics.odometry_faults
+    given = recording, prior(recording), slam.SlamOptions(), silent
+    assert odometry_2d.register_scans(*given).diagnostics.odometry_faults == []
+    matched = odometry_2d.register_scans(*given, faults=np.array([20]))
+    assert matched.diagnostics.odometry_faults == [20]
+
+
+def test_odometry_that_jumps_at_every_scan():
+    simulation = room()
+    jumps = np.random.default_rng(0).normal(size=(3, 80)) * [[0.5], [0.5], [0.3]]
+    odometry = simulation.recording.T_odom_base @ se2.matrix(*jumps)
+    recording = dataclasses.replace(simulation.recording, T_odom_base=odometry)
+    estimated = slam.m_step(recording, prior(recording), slam.SlamOptions(), None, 1, silent)
+    assert ate(estimated, simulation.truth) < 0.02
 
 
 def test_an_iteration_keeps_poses_that_are_more_likely(monkeypatch):

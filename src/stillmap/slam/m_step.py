@@ -21,7 +21,7 @@ from stillmap.slam.loop_closure_3d import close_loops_3d
 from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, add_scan, thin_scans
-from stillmap.slam.step_alternatives import revise_steps
+from stillmap.slam.step_alternatives import PoseMethods, revise_steps
 from stillmap.slam.types import MStepResult, ScanProgress
 
 _SCANS_PER_CALL = 200  # of the kernel; interrupts are noticed in between
@@ -88,10 +88,10 @@ def _motion_steps(
         increments (T, 3, 3); their std (T, 2) in m and rad; which are known (T,), False across
         breaks and after the last scan.
     """
-    motion = se2.inverse(poses[:-1]) @ poses[1:]
+    motion = se2.increments(poses)
     increments, std = motion, np.tile(motion_model.MIN_INCREMENT_STD, (len(motion), 1))
     if recording.T_odom_base is not None:
-        measured = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
+        measured = se2.increments(recording.T_odom_base)
         noise, is_fault = motion_model.fit_odometry_noise(measured, motion, options.odometry)
         increments = np.where(is_fault[:, None, None], motion, measured)
         std = motion_model.increment_std(increments, options.odometry, noise)
@@ -142,18 +142,20 @@ def m_step(
     grid = em.make_grid(D, options.resolution, free_space_margin)
     if poses is not None:
         dof = D * (D + 1) // 2
-        found = MStepResult(poses, np.zeros((T, dof, dof)), grid, np.full(T, np.nan))
+        estimated = MStepResult(poses, np.zeros((T, dof, dof)), grid, np.full(T, np.nan))
     else:
         matched, weights = thin_scans(recording, e) if D == 2 else (recording, e)
         step = _PoseStep(matched, weights, options, threads, progress, free_space_margin)
-        found = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses, earlier)
+        estimated = (
+            step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses, earlier)
+        )
         progress("counting beams", 0, 0)
     if with_grid:
-        deskewed = deskew_recording(recording, found.poses, options, threads)
-        em.add_recording(grid, deskewed, found.poses, e, threads)
+        deskewed = deskew_recording(recording, estimated.poses, options, threads)
+        em.add_recording(grid, deskewed, estimated.poses, e, threads)
     if poses is not None:
         progress("matching scans", T, T)
-    return dataclasses.replace(found, grid=grid)
+    return dataclasses.replace(estimated, grid=grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +175,11 @@ class _PoseStep:
         matching, closing = self._progress("matching scans"), self._progress("closing loops")
         odometry = register_sweeps(recording, e, options.odometry, matching, threads)
         empty = em.make_grid(3, options.resolution)
-        found = MStepResult(odometry.poses, odometry.covariance, empty, odometry.explained)
+        estimated = MStepResult(odometry.poses, odometry.covariance, empty, odometry.explained)
         if not options.loop_closure:
-            return found
+            return estimated
         poses, loops, graph = close_loops_3d(recording, e, options, odometry, closing, threads)
-        return dataclasses.replace(found, poses=poses, loops=loops, graph=graph)
+        return dataclasses.replace(estimated, poses=poses, loops=loops, graph=graph)
 
     def estimate_2d(
         self,
@@ -191,37 +193,32 @@ class _PoseStep:
         recording, options = self.recording, self.options
         motion = recording.T_odom_base if earlier_poses is None else earlier_poses
         if motion is None and options.deskew and recording.beam_time is not None:
-            motion = self._match_scans(recording, self.e).poses  # skewed scans are good enough
+            motion = self._match_scans(recording).poses  # skewed scans are good enough
         deskewed = self._deskew(motion)
-        matched = self._match_scans(deskewed, self.e)
+        matched = self._match_scans(deskewed)
         if not options.loop_closure:
             return matched
         placed = place_segments(self._deskew(matched.poses), self.e, options, matched)
 
-        def match_part(
-            part: Recording, e: Float32, search_wider: bool, faults: Index
-        ) -> MStepResult:
-            return self._part(part, e)._match_scans(part, e, search_wider, faults)
-
-        def finish(scans: Recording, e: Float32, trajectory: MStepResult) -> MStepResult:
-            step = self if scans is deskewed else self._part(scans, e)
-            return step._close_loops(trajectory)
-
         if earlier is not None:
             earlier = self._refine(earlier, self._progress("refining poses"))
-        return revise_steps(deskewed, self.e, options, placed, match_part, finish, earlier)
+        methods = PoseMethods(
+            lambda part, e, *how: self._of_part(part, e)._match_scans(part, *how),
+            self._close_loops,
+            lambda part, e, trajectory: self._of_part(part, e)._close_loops(trajectory),
+        )
+        return revise_steps(deskewed, self.e, options, placed, methods, earlier)
 
     def _match_scans(
         self,
         scans: Recording,
-        e: Float32,
         search_wider: bool = True,
         faults: Index | None = None,
     ) -> MStepResult:
         """Incremental scan matching."""
         return register_scans(
             scans,
-            e,
+            self.e,
             self.options,
             self._progress("matching scans"),
             _LOCAL_MAP_TRAVEL if self.options.loop_closure else np.inf,
@@ -244,7 +241,7 @@ class _PoseStep:
         # a misregistered scan agrees with a map that contains it: keep the share from the local map
         return dataclasses.replace(refined, explained=initial.explained)
 
-    def _part(self, scans: Recording, e: Float32) -> "_PoseStep":
+    def _of_part(self, scans: Recording, e: Float32) -> "_PoseStep":
         """The same of some scans, without progress."""
         return dataclasses.replace(self, recording=scans, e=e, progress=lambda *_: None)
 

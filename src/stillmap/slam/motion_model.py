@@ -197,9 +197,17 @@ def _unannounced_motion(acceleration: float, seconds: float) -> float:
     return min(max(0.5 * acceleration * seconds**2, _TRANSLATION_FLOOR), _MAX_UNANNOUNCED)
 
 
+def onward_std(stamp_ns: Int64) -> Float:
+    """(T - 1, 2) m and rad, standard deviations of steps at constant velocity at stamps (T,)."""
+    squared = np.square(1e-9 * np.diff(stamp_ns))[:, None]
+    std = 0.5 * squared * [_ACCELERATION, _ANGULAR_ACCELERATION]
+    out: Float = std.clip(MIN_INCREMENT_STD, [_INITIAL_TRANSLATION, _INITIAL_ROTATION])
+    return out
+
+
 def compute_odometry_steps(T_odom_base: Float, stamp_ns: Int64) -> OdometrySteps:
     """The steps between poses (T, 3, 3) with stamps (T,); a leap is too fast for the robot."""
-    increments = se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]
+    increments = se2.increments(T_odom_base)
     metres = np.linalg.norm(increments[:, :2, 2], axis=1)
     if not len(metres):
         return OdometrySteps(increments, np.ones(0, np.bool_))

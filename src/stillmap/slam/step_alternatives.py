@@ -3,8 +3,7 @@
 Scan matching decides at each scan, before it sees where that leads. Where it found a scan outside
 odometry's prior, three hypotheses may explain the scans around it better: that odometry was right,
 that it failed at these scans only, or that it failed throughout. The one is taken whose map has the
-higher marginal likelihood. Beams that end in free space or pass through walls lower it; so does
-every new cell, and a place that is mapped twice.
+higher marginal likelihood.
 """
 
 import dataclasses
@@ -14,27 +13,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
-from stillmap.slam import local_map, motion_model, scan_hits
+from stillmap.slam import local_map, scan_hits
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
+from stillmap.slam.trajectory_cost import OdometryCost, count_beams, map_evidence
 from stillmap.slam.types import MStepResult
 
-# prior Beta(a, b) of the occupancy of a cell: most cells are free, few are anything in between
-_PRIOR = 0.1, 0.5
 # m of travel and scans on both sides, at least: that are matched again, and that are compared, as
 # far as the local map reaches
 _MATCHED_AGAIN, _COMPARED = (10.0, 8), (25.0, 10)
 # scans over which two motions are compared; m and rad from which they differ
 _SPAN, _SAME = 3, np.array([0.1, 0.05])
 
-# scan matching of a recording given e (M,), with or without a wider search, and scans at which
-# odometry fails; and the same with loops closed
-Register = Callable[[Recording, Float32, bool, Index], MStepResult]
-Finish = Callable[[Recording, Float32, MStepResult], MStepResult]
+
+class PoseMethods(NamedTuple):
+    """How trajectories are estimated.
+
+    Attributes:
+        match_part: scan matching of a part of the recording given its e, with or without a wider
+            search, and scans at which odometry fails.
+        close_loops: closes the loops of a trajectory of the whole recording.
+        close_part: the same of a part, given its e.
+    """
+
+    match_part: Callable[[Recording, Float32, bool, Index], MStepResult]
+    close_loops: Callable[[MStepResult], MStepResult]
+    close_part: Callable[[Recording, Float32, MStepResult], MStepResult]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +103,7 @@ class _Choice(NamedTuple):
     """A trajectory, the same with loops closed, and its cost in nats."""
 
     matched: MStepResult
-    finished: MStepResult
+    closed: MStepResult
     cost: float
 
 
@@ -106,8 +112,7 @@ def revise_steps(
     e: Float32,
     options: SlamOptions,
     matched: MStepResult,
-    register: Register,
-    finish: Finish,
+    methods: PoseMethods,
     earlier: MStepResult | None = None,
 ) -> MStepResult:
     """The most likely trajectory, with loops closed.
@@ -117,21 +122,20 @@ def revise_steps(
         e: (M,) P(static) of every beam.
         options: see SlamOptions.
         matched: result of incremental scan matching, with segments in place.
-        register: scan matching of a part of the recording.
-        finish: closes loops.
+        methods: see PoseMethods.
         earlier: trajectory of an earlier iteration, which is kept if it is more likely than
             `matched`: an M-step does not lower the likelihood.
     """
-    finished = finish(recording, e, matched)
-    comparison = _Comparison(recording, e, options, matched, finish)
-    best = _Choice(matched, finished, comparison.cost(finished))
+    comparison = _Comparison(recording, e, options, matched, methods)
+    closed = methods.close_loops(matched)
+    best = _Choice(matched, closed, comparison.cost(closed))
     if earlier is not None and comparison.cost(earlier) < best.cost:
         return earlier
     changed = np.ones(recording.n_scans, np.bool_)
-    while alternatives := comparison.propose(best.matched, register, changed):
+    while alternatives := comparison.propose(best.matched, changed):
         before, best = best.matched, comparison.choose(best, alternatives)
         changed = comparison.around(_changed_steps(before, best.matched))
-    return best.finished
+    return best.closed
 
 
 class _Comparison:
@@ -143,48 +147,39 @@ class _Comparison:
         e: Float32,
         options: SlamOptions,
         matched: MStepResult,
-        finish: Finish,
+        methods: PoseMethods,
     ) -> None:
-        self.recording, self.e, self.options, self.finish = recording, e, options, finish
+        self.recording, self.e, self.options, self.methods = recording, e, options, methods
         self.travelled = local_map.travelled_distance(matched.poses)
         self.kept = local_map.select_keyframes_per_sensor(
             matched.poses, recording.sensor, local_map.SCAN_SPACING, local_map.SCAN_SPACING
         )
-        self.increments: Float | None = None
-        if recording.T_odom_base is not None:
-            self.increments = _steps(recording.T_odom_base)
-            noise, _ = motion_model.fit_odometry_noise(
-                self.increments, _steps(matched.poses), options.odometry
-            )
-            self.std = motion_model.increment_std(self.increments, options.odometry, noise)
+        self.odometry_cost = OdometryCost(recording, matched.poses, options.odometry)
 
     def choose(self, best: _Choice, alternatives: list[_Alternative]) -> _Choice:
         """The more likely of a trajectory and the same with alternatives: all of them, or parts."""
         matched = best.matched
         for alternative in alternatives:
             matched = alternative.replace_in(matched)
-        finished = self.finish(self.recording, self.e, matched)
-        cost = self.cost(finished)
+        closed = self.methods.close_loops(matched)
+        cost = self.cost(closed)
         if cost < best.cost:
-            return _Choice(matched, finished, cost)
+            return _Choice(matched, closed, cost)
         if len(alternatives) == 1:
             return best
         half = len(alternatives) // 2
         return self.choose(self.choose(best, alternatives[:half]), alternatives[half:])
 
-    def propose(
-        self, matched: MStepResult, register: Register, changed: Bool
-    ) -> list[_Alternative]:
+    def propose(self, matched: MStepResult, changed: Bool) -> list[_Alternative]:
         """Alternatives that the scans around them make more likely, in the order of the scans.
 
         Args:
             matched: the trajectory.
-            register: as of `revise_steps`.
             changed: (T,) scans that did not lie so before: elsewhere nothing new is to be found.
         """
         proposed = [
             dataclasses.replace(alternative, gain=gain)
-            for alternative in self._match_again(matched, register, changed)
+            for alternative in self._match_again(matched, changed)
             if (gain := self._gain(matched, alternative)) > 0.0
         ]
         chosen: list[_Alternative] = []
@@ -200,14 +195,12 @@ class _Comparison:
             out[slice(*_window(self.travelled, t, t + 1, _COMPARED))] = True
         return out
 
-    def _match_again(
-        self, matched: MStepResult, register: Register, changed: Bool
-    ) -> Iterator[_Alternative]:
+    def _match_again(self, matched: MStepResult, changed: Bool) -> Iterator[_Alternative]:
         """Steps that differ if odometry is right, fails at scans found far off, or throughout."""
         widened = np.array(matched.diagnostics.widened, np.intp)
         rejected = np.union1d(widened, np.array(matched.diagnostics.odometry_faults, np.intp))
         for is_wide, without_odometry in ((False, False), (True, False), (True, True)):
-            if is_wide and self.increments is None:
+            if is_wide and self.recording.T_odom_base is None:
                 return
             at = rejected if without_odometry else widened
             at = at[changed[at]]
@@ -215,7 +208,9 @@ class _Comparison:
                 part, e = self._select(first, last)
                 faults = widened[(first < widened) & (widened < last)] - first
                 source = part.without_odometry() if without_odometry else part
-                steps = register(source, e, is_wide, faults if is_wide else faults[:0])
+                steps = self.methods.match_part(
+                    source, e, is_wide, faults if is_wide else faults[:0]
+                )
                 for a, b in _differences(matched.poses[first:last], steps.poses):
                     # whether the robot was carried is decided where segments are placed
                     if not any(a <= t < b for t in steps.diagnostics.breaks):
@@ -225,40 +220,29 @@ class _Comparison:
         """Nats by which the steps of an alternative and the scans around them are more likely."""
         first, last = _window(self.travelled, alternative.a, alternative.b, _COMPARED)
         cuts = [t for t in matched.diagnostics.breaks if first < t < last]
+        span = alternative.a, alternative.b
         costs = []
         for trajectory in (matched, alternative.replace_in(matched)):
-            cost = self._motion_cost(trajectory.poses, alternative.a, alternative.b)
+            cost = self.odometry_cost(trajectory.poses, *span)
             for start, end in zip([first, *cuts], [*cuts, last], strict=True):
-                cost += self._scan_cost(self._finish_part(trajectory, start, end), start)
+                cost += self._scan_cost(self._close_part(trajectory, start, end), start)
             costs.append(cost)
         return costs[0] - costs[1]
 
-    def cost(self, finished: MStepResult) -> float:
+    def cost(self, closed: MStepResult) -> float:
         """Nats, -ln of the probability of all scans and steps, up to a constant."""
-        poses = finished.poses
-        return self._motion_cost(poses, 1, len(poses)) + self._scan_cost(poses, 0)
+        poses = closed.poses
+        return self.odometry_cost(poses, 1, len(poses)) + self._scan_cost(poses, 0)
 
     def _scan_cost(self, poses: Float, first: int) -> float:
-        """-ln of the marginal likelihood of spaced scans from `first` on at poses (n, 3, 3)."""
-        grid = _core.OccupancyGrid2D(self.options.resolution, moments=False)
+        """-ln of the evidence of the map of spaced scans from `first` on at poses (n, 3, 3)."""
         within = np.searchsorted(self.kept, [first, first + len(poses)])
-        for t in self.recording.iter_scans(self.kept[slice(*within)], self.e):
-            beams = self.recording.beams_of(t)
-            points, hit = self.recording.points[beams], self.recording.hit[beams]
-            T = poses[t - first] @ self.recording.T_base_sensor[self.recording.sensor[t]]
-            _core.add_beams(grid, points, hit, self.e[beams], np.array([0, len(hit)]), T[None])
-        return -INFORMATION_SCALE * grid.log_evidence(*_PRIOR)
+        scans = self.kept[slice(*within)]
+        resolution = self.options.resolution
+        grid = count_beams(self.recording, self.e, scans, poses[scans - first], resolution)
+        return -map_evidence(grid)
 
-    def _motion_cost(self, poses: Float, a: int, b: int) -> float:
-        """-ln of the probability of the steps to a to b - 1 given odometry, which may fail."""
-        if self.increments is None:
-            return 0.0
-        steps, std = slice(a - 1, b - 1), self.std[a - 1 : b - 1]
-        residual = se2.inverse(self.increments[steps]) @ _steps(poses[a - 1 : b])
-        d = se2.parameters(residual) / std[:, [0, 0, 1]]
-        return float(np.minimum(0.5 * (d**2).sum(axis=1), FAULT_COST).sum())
-
-    def _finish_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
+    def _close_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
         """Poses of the scans from first to last - 1 with the loops among them closed."""
         part, e = self._select(first, last)
         scans = slice(first, last)
@@ -270,7 +254,7 @@ class _Comparison:
             trajectory.explained[scans],
             drift,
         )
-        return self.finish(part, e, matched).poses
+        return self.methods.close_part(part, e, matched).poses
 
     def _select(self, first: int, last: int) -> tuple[Recording, Float32]:
         """The scans from first to last - 1 and the e of their beams."""
@@ -281,15 +265,10 @@ class _Comparison:
         return part, self.e[recording.offset[first] : recording.offset[last]]
 
 
-def _steps(poses: Float) -> Float:
-    """(T - 1, 3, 3) motions between successive poses."""
-    return se2.inverse(poses[:-1]) @ poses[1:]
-
-
 def _changed_steps(before: MStepResult, after: MStepResult) -> Bool:
     """(T,) scans whose step differs."""
-    differs = _differ(_steps(before.poses), _steps(after.poses))
-    return np.append(False, differs)
+    steps, steps_after = (se2.increments(trajectory.poses) for trajectory in (before, after))
+    return np.append(False, _differ(steps, steps_after))
 
 
 def _windows(travelled: Float, at: Index) -> list[tuple[int, int]]:
@@ -320,12 +299,12 @@ def _differences(P: Float, Q: Float) -> list[tuple[int, int]]:
             differs[k : len(P) - span + k] |= far
     at = np.flatnonzero(differs)
     parts = np.split(at, np.flatnonzero(np.diff(at) > _SPAN) + 1) if len(at) else []
-    # a scan that lies askew between two that do not moves nothing after it
+    # a single scan that lies askew moves nothing after it
     ends = [(int(part[0]) - 1, int(part[-1])) for part in parts]
     return [
         (a + 1, b + 1)
         for a, b in ends
-        if _differ(se2.inverse(P[a]) @ P[b], se2.inverse(Q[a]) @ Q[b])
+        if b - a > 2 * _SPAN or _differ(se2.inverse(P[a]) @ P[b], se2.inverse(Q[a]) @ Q[b])
     ]
 
 

@@ -1,0 +1,58 @@
+"""Cost of steps given odometry: the likeliest states of a hidden Markov model."""
+
+import itertools
+
+import numpy as np
+import pytest
+from rooms import drive
+from scipy.stats import norm
+
+from stillmap.core import se2
+from stillmap.slam import motion_model, trajectory_cost
+from stillmap.slam.options import OdometryOptions
+from stillmap.slam.scan_matching import FAULT_COST
+
+
+def run_with_a_fault(scans=9):
+    simulation = drive(2, robot={"scans": scans})
+    recording, poses = simulation.recording, simulation.truth.T_world_base
+    recording.T_odom_base[4:] = recording.T_odom_base[4:] @ se2.matrix(0.5, 0.2, 0.3)
+    return recording, poses
+
+
+def test_cost_is_that_of_the_likeliest_states():
+    recording, poses = run_with_a_fault()
+    cost = trajectory_cost.OdometryCost(recording, poses, OdometryOptions())
+    steps, measured = se2.increments(poses), se2.increments(recording.T_odom_base)
+    onward = np.concatenate([steps[:1], steps[:-1]])
+
+    def nats(expected, std):
+        d = se2.parameters(se2.inverse(expected) @ steps)
+        return -norm.logpdf(d, scale=std).sum(axis=1) - 1.5 * np.log(2.0 * np.pi)
+
+    emission = np.array([nats(measured, cost.std), nats(onward, cost.onward_std)])
+    change = np.array([[0.0, FAULT_COST], [trajectory_cost._RECOVERY_COST, 0.0]])
+    costs = []
+    for states in itertools.product((0, 1), repeat=len(steps)):
+        changes = change[(0, *states[:-1]), states].sum()
+        costs.append(changes + emission[states, np.arange(len(steps))].sum())
+    assert cost(poses, 1, len(poses)) == pytest.approx(min(costs), rel=1e-9)
+    assert np.argmin(costs) != 0  # of states that are all valid
+
+
+def test_a_part_starts_with_valid_odometry():
+    recording, poses = run_with_a_fault()
+    cost = trajectory_cost.OdometryCost(recording, poses, OdometryOptions())
+    assert cost(poses, 1, 4) + cost(poses, 4, 9) == pytest.approx(cost(poses, 1, 9), rel=1e-9)
+
+
+def test_without_odometry_steps_cost_nothing():
+    recording, poses = run_with_a_fault()
+    cost = trajectory_cost.OdometryCost(recording.without_odometry(), poses, OdometryOptions())
+    assert cost(poses, 1, len(poses)) == 0.0
+
+
+def test_motion_at_constant_velocity_is_less_certain_over_longer_times():
+    std = motion_model.onward_std(np.array([0, 1e8, 4e8, 14e8], np.int64))
+    assert (np.diff(std, axis=0) >= 0.0).all()
+    assert std[0, 0] < std[2, 0]
