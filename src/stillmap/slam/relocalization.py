@@ -66,23 +66,17 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         context = dataclasses.replace(context, poses=poses)
         covariance = transfer_covariance(context, covariance, previous, first)
         segment = Segment(context, first, last, covariance)
-        previous, is_placed, C = first, True, np.eye(3)
-        here = segment.follow_odometry()
-        there = None if here.is_verified else segment.find_place()
-        if here.is_verified:
-            C = here.C
-        elif there is not None and there.score > max(here.score, 0.0):
-            C = there.C
-            out.closures.extend(there.closures)
-            if there.is_elsewhere:
+        previous, best = first, segment.follow_odometry()
+        if not best.is_likely:
+            best = max(best, segment.find_place() or best, key=lambda placement: placement.score)
+        if best.is_likely:
+            covariance = np.zeros((3, 3))
+            poses[first:] = se2.normalize(best.C @ poses[first:])
+            out.closures.extend(best.closures)
+            if best.is_elsewhere:
                 out.breaks.append(first)
-        else:
-            is_placed = False
-            C = here.C if here.fitting > here.contradicting else C
-            if there is not None or here.contradicting > here.fitting:
-                out.ambiguous.append(first)
-        covariance = np.zeros((3, 3)) if is_placed else covariance
-        poses[first:last] = C @ poses[first:last]
+        elif best.gain < 0.0:
+            out.ambiguous.append(first)
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
 
 

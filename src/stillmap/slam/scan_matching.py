@@ -116,13 +116,13 @@ def widen_match(
         usual: recent average of the explained share.
     """
     threshold = _WIDEN_BELOW * usual
-    cost = _evidence_cost(prior, match)
+    cost = match.cost + motion_cost(prior, match)
     for mean, window in itertools.product((prior, alternative), _WIDE_WINDOWS):
         if mean is None or match.explained >= threshold:
             continue
         wide = motion_model.widen_prior(mean, *(half / _SEARCH_STDS for half in window))
         wider = _search_window(grid, scan, wide)
-        cost_of_fault = _evidence_cost(wide, wider) + FAULT_COST
+        cost_of_fault = wider.cost + motion_cost(wide, wider) + FAULT_COST
         # at a place that only looks alike, beams would pass through walls
         is_alike = occluded_share(grid, scan, wider.T_map_base) > MAX_OCCLUDED
         if cost_of_fault < cost and not is_alike:
@@ -161,7 +161,7 @@ def _match_within_prior(
     if local.explained >= _LOCAL_SHARE * usual:
         return local
     matches = local, _search_window(grid, scan, prior)
-    return min(matches, key=lambda match: _evidence_cost(prior, match))
+    return min(matches, key=lambda match: match.cost + motion_cost(prior, match))
 
 
 def _search_window(grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior) -> ScanMatch:
@@ -170,14 +170,14 @@ def _search_window(grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior) 
     return search_pose(grid, scan, prior, *(_SEARCH_STDS * std for std in stds))
 
 
-def _evidence_cost(prior: MotionPrior, match: ScanMatch) -> float:
-    """Nats, -ln of the probability of a scan given a prior of its motion.
+def motion_cost(prior: MotionPrior, match: ScanMatch) -> float:
+    """Nats of the motion of a scan: the prior's, and how much more it allowed than the scan does.
 
-    Laplace's approximation of the integral over poses, in which the width of the prior counts:
+    With the cost of the scan, Laplace's approximation of the integral over poses:
     cost + 1/2 ln(det prior covariance / det posterior covariance).
     """
     volume = np.linalg.slogdet(match.covariance)[1] + np.linalg.slogdet(prior.information)[1]
-    return match.cost + prior.cost(match.T_map_base) - 0.5 * float(volume)
+    return prior.cost(match.T_map_base) - 0.5 * float(volume)
 
 
 def _distance(prior: MotionPrior, T_map_base: Float) -> tuple[float, float]:

@@ -10,20 +10,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Index
 from stillmap.slam import loop_verification, scan_matching
 from stillmap.slam.loop_candidates import drift_std
 from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.trajectory_cost import count_beams, map_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 _MAX_QUERIES = 8  # keyframes of a segment that are matched
 _MAX_PLACES = 8  # places that each of them is matched with
 _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
-# keyframes that must fit, and how many one that contradicts outweighs; nats, at least and per
-# keyframe, that a place costs where odometry does not lead: many are tried
-_MIN_SUPPORT, _CONTRADICTION_WEIGHT, _ELSEWHERE, _ELSEWHERE_PER_KEYFRAME = 3, 4, 8.0, 0.3
+# prior Beta(a, b) of the occupancy of a cell: that both maps are free there says next to nothing
+_PRIOR = 0.02, 0.5
+# nats of a place where odometry does not lead: robots are carried at one gap in 10^6, to any of
+# 10^8 poses; and per tested keyframe, for unknown parts of a building look like those of the map
+_CARRIED_COST, _LOOKALIKE_COST = 32.0, 8.0
 _MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 
@@ -34,33 +38,29 @@ class Placement:
 
     Attributes:
         C: (3, 3) motion of the segment from where odometry has it.
-        fitting, contradicting: keyframes that fit the map before it, and that contradict it.
-        tested: keyframes, those that see other places included.
-        cost: nats of the motion under odometry; no more than that of a robot that was carried.
-        closures: that lead there.
+        is_matched: at least one keyframe fits there.
+        gain: nats of evidence of the map of both, over that of a map of each.
+        cost: nats of the motions that lead there: errors of odometry, or a robot that was carried.
+        is_elsewhere: odometry does not lead there.
+        closures: that do.
     """
 
     C: Float
-    fitting: int
-    contradicting: int
-    tested: int
-    cost: float = 0.0
+    is_matched: bool
+    gain: float
+    cost: float
+    is_elsewhere: bool = False
     closures: list[LoopClosure] = field(default_factory=list)
 
     @property
+    def is_likely(self) -> bool:
+        """True if a keyframe fits, and the evidence outweighs the cost."""
+        return self.is_matched and self.score > 0.0
+
+    @property
     def score(self) -> float:
-        """Keyframes in favour; each one that contradicts outweighs several."""
-        return self.fitting - _CONTRADICTION_WEIGHT * self.contradicting - self.cost
-
-    @property
-    def is_verified(self) -> bool:
-        """True if enough keyframes fit, and outweigh those that contradict."""
-        return self.fitting >= _MIN_SUPPORT and self.score >= 0
-
-    @property
-    def is_elsewhere(self) -> bool:
-        """True if odometry does not lead there."""
-        return self.cost >= _cost_of_carrying(self.tested)
+        """Nats by which the segment is more likely to lie there than in an unknown place."""
+        return self.gain - self.cost
 
 
 class Segment:
@@ -80,23 +80,28 @@ class Segment:
         self._tested = _select_evenly(self._keyframes, _MAX_TESTED)
         scans = context.recording.iter_scans(self._earlier.tolist(), context.e)
         self._map = context.build_map(scans)
+        self._counts_before = self._count(self._earlier.tolist(), context.poses[self._earlier])
+        alone = self._count(self._tested, context.poses[self._tested])
+        self._apart = sum(map_evidence(grid, _PRIOR) for grid in (self._counts_before, alone))
 
     def follow_odometry(self) -> Placement:
         """The segment where odometry leads, within its covariance."""
         return self._follow(np.eye(3), self._first, self._covariance)
 
     def find_place(self) -> Placement | None:
-        """The place at which most keyframes of the segment fit, where odometry leads or elsewhere.
-
-        Rooms look alike: a place counts only if the rest of the segment does not contradict it.
-        """
+        """The most likely place at which keyframes fit, near odometry or elsewhere."""
         best: Placement | None = None
         closures = list(self._match_places())
+        carried = _CARRIED_COST + _LOOKALIKE_COST * len(self._tested)
         for closure in self._deduplicate(closures):
             placement = self._follow(self._motion(closure), closure.later, np.zeros((3, 3)))
-            cost = min(self._cost(placement.C), _cost_of_carrying(placement.tested))
-            placement = dataclasses.replace(placement, cost=cost)
-            if placement.is_verified and (best is None or placement.score > best.score):
+            motion = self._odometry_cost(placement.C)
+            placement = dataclasses.replace(
+                placement,
+                cost=placement.cost + min(motion, carried),
+                is_elsewhere=motion > carried,
+            )
+            if best is None or placement.score > best.score:
                 best = placement
         if best is None:
             return None
@@ -112,7 +117,8 @@ class Segment:
             covariance: (3, 3) of its pose, map axes.
         """
         context, k = self._context, int(np.searchsorted(self._tested, start))
-        fitting, contradicting, C_first = 0, 0, None
+        C_first: Float | None = None
+        cost, poses = 0.0, dict[int, Float]()
         for scans in (self._tested[k:], self._tested[:k][::-1]):
             moved, spread, previous = C, covariance, start
             for t in scans:
@@ -120,22 +126,35 @@ class Segment:
                 metres = abs(float(context.travelled[t] - context.travelled[previous]))
                 prior = _drifted_prior(moved @ context.poses[t], spread, metres)
                 previous, scan = t, context.hits(t)
+                poses[t] = prior.T_map_base
                 if len(scan.points) == 0:
                     continue
                 usual = float(context.explained[t])
                 match = scan_matching.match_scan(self._map, scan, prior, usual)
                 occluded = scan_matching.occluded_share(self._map, scan, match.T_map_base)
-                if occluded > scan_matching.MAX_OCCLUDED:
-                    contradicting += 1
-                elif match.explained >= loop_verification.MIN_EXPLAINED:
-                    fitting += 1
+                if (
+                    occluded <= scan_matching.MAX_OCCLUDED
+                    and match.explained >= loop_verification.MIN_EXPLAINED
+                ):
+                    poses[t] = match.T_map_base
+                    cost += scan_matching.motion_cost(prior, match)
                     moved = match.T_map_base @ se2.inverse(context.poses[t])
                     spread = np.zeros((3, 3))
                     C_first = moved if C_first is None else C_first
-        C_first = C if C_first is None else C_first
-        return Placement(C_first, fitting, contradicting, len(self._tested))
+        gain = self._gain(np.array([poses[t] for t in self._tested]))
+        return Placement(C if C_first is None else C_first, C_first is not None, gain, cost)
 
-    def _cost(self, C: Float) -> float:
+    def _count(self, scans: list[int], poses: Float) -> _core.OccupancyGrid2D:
+        context = self._context
+        return count_beams(context.recording, context.e, scans, poses, context.resolution)
+
+    def _gain(self, poses: Float) -> float:
+        """Nats of the map with the tested keyframes at poses (n, 3, 3), over that of each apart."""
+        together = self._count(self._tested, poses)
+        together.merge(self._counts_before)
+        return map_evidence(together, _PRIOR) - self._apart
+
+    def _odometry_cost(self, C: Float) -> float:
         """Nats of a motion (3, 3) of the segment under odometry."""
         T_odom = self._context.poses[self._first]
         prior = _drifted_prior(T_odom, self._covariance, 0.0)
@@ -214,11 +233,6 @@ def _drifted_prior(T_map_base: Float, covariance: Float, metres: float) -> Motio
     total = covariance + np.diag(np.square([translation, translation, rotation]))
     std = float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[1])), float(np.sqrt(total[2, 2]))
     return MotionPrior(se2.normalize(T_map_base), np.linalg.inv(total), *std, is_odometry=True)
-
-
-def _cost_of_carrying(tested: int) -> float:
-    """Nats of a robot that was carried to one of many places, in terms of so many keyframes."""
-    return max(_ELSEWHERE, _ELSEWHERE_PER_KEYFRAME * tested)
 
 
 def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:

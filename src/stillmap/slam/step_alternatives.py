@@ -21,6 +21,8 @@ from stillmap.slam.options import SlamOptions
 from stillmap.slam.trajectory_cost import OdometryCost, count_beams, map_evidence
 from stillmap.slam.types import MStepResult
 
+# prior Beta(a, b) of the occupancy of a cell: most cells are free, few are anything in between
+_PRIOR = 0.1, 0.5
 # m of travel and scans on both sides, at least: that are matched again, and that are compared, as
 # far as the local map reaches
 _MATCHED_AGAIN, _COMPARED = (10.0, 8), (25.0, 10)
@@ -240,7 +242,7 @@ class _Comparison:
         scans = self.kept[slice(*within)]
         resolution = self.options.resolution
         grid = count_beams(self.recording, self.e, scans, poses[scans - first], resolution)
-        return -map_evidence(grid)
+        return -map_evidence(grid, _PRIOR)
 
     def _close_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
         """Poses of the scans from first to last - 1 with the loops among them closed."""

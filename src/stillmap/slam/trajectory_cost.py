@@ -12,18 +12,20 @@ from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
 
-# prior Beta(a, b) of the occupancy of a cell: most cells are free, few are anything in between
-_PRIOR = 0.1, 0.5
 _RECOVERY_COST = 2.3  # nats: odometry that failed is valid again after ten scans
 
 
-def map_evidence(grid: _core.OccupancyGrid2D) -> float:
+def map_evidence(grid: _core.OccupancyGrid2D, prior: tuple[float, float]) -> float:
     """ln of the marginal likelihood of the counts (10), times the gain of dependent beams.
 
     The occupancy of each cell is integrated out: beams that end in free space or pass through walls
     cost, and so does every new cell, and a place that is mapped twice.
+
+    Args:
+        grid: the counts.
+        prior: a, b of the Beta distribution of the occupancy of a cell.
     """
-    evidence: float = INFORMATION_SCALE * grid.log_evidence(*_PRIOR)
+    evidence: float = INFORMATION_SCALE * grid.log_evidence(*prior)
     return evidence
 
 
