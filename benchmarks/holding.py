@@ -52,10 +52,10 @@ ABLATION = (
         constants={"relocalization._MIN_CONTRADICTING_SCANS": 1},
     ),
     Variant(
-        "the first place that fits is taken",
+        "a place elsewhere costs nothing",
         constants={
-            "segment_placement._ELSEWHERE": 0.0,
-            "segment_placement._ELSEWHERE_PER_KEYFRAME": 0.0,
+            "segment_placement._CARRIED_COST": 0.0,
+            "segment_placement._LOOKALIKE_COST": 0.0,
         },
     ),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),

@@ -65,17 +65,48 @@ Box<D> box_around(const OccupancyGrid<D>& grid) {
   return box;
 }
 
-// Log marginal likelihood of all counts, each cell's occupancy integrated out: sum over cells of
+// Log marginal likelihood of the counts of a cell whose occupancy has the prior Beta(a, b):
 // ln B(alpha + a, beta + b) - ln B(a, b).
+class CellEvidence {
+ public:
+  CellEvidence(double a, double b) : a_(a), b_(b) {
+    require(a > 0.0 && b > 0.0, "a, b: expected positive pseudo-counts");
+    of_hits_ = std::lgamma(a);
+    of_both_ = std::lgamma(a + b) - of_hits_ - std::lgamma(b);
+  }
+
+  double operator()(Fixed alpha, Fixed beta) const {
+    const double hits = alpha == 0 ? of_hits_ : std::lgamma(from_fixed(alpha) + a_);
+    return hits + std::lgamma(from_fixed(beta) + b_) -
+           std::lgamma(from_fixed(alpha + beta) + a_ + b_) + of_both_;
+  }
+
+ private:
+  double a_, b_, of_hits_, of_both_;
+};
+
 template <int D>
 double log_evidence(const OccupancyGrid<D>& grid, double a, double b) {
-  require(a > 0.0 && b > 0.0, "a, b: expected positive pseudo-counts");
-  const double of_hits = std::lgamma(a), of_both = std::lgamma(a + b) - of_hits - std::lgamma(b);
+  const CellEvidence evidence(a, b);
   double sum = 0.0;
-  for_each_observed(grid, [&](const Cell<D>&, const CellCounts& c) {
-    const double alpha = from_fixed(c.alpha), beta = from_fixed(c.beta);
-    const double hits = c.alpha == 0 ? of_hits : std::lgamma(alpha + a);
-    sum += hits + std::lgamma(beta + b) - std::lgamma(alpha + beta + a + b) + of_both;
+  for_each_observed(grid,
+                    [&](const Cell<D>&, const CellCounts& c) { sum += evidence(c.alpha, c.beta); });
+  return sum;
+}
+
+// Log evidence of the counts of both grids in one map over that of a map of each.
+template <int D>
+double evidence_gain(const OccupancyGrid<D>& grid, const OccupancyGrid<D>& other, double a,
+                     double b) {
+  require(grid.resolution() == other.resolution(), "other: expected the same resolution");
+  const CellEvidence evidence(a, b);
+  BlockCursor<const OccupancyGrid<D>> cursor(grid);
+  double sum = 0.0;
+  for_each_observed(other, [&](const Cell<D>& cell, const CellCounts& c) {
+    const CellCounts* here = cursor.find_observed(cell);
+    if (here == nullptr) return;
+    sum += evidence(here->alpha + c.alpha, here->beta + c.beta);
+    sum -= evidence(here->alpha, here->beta) + evidence(c.alpha, c.beta);
   });
   return sum;
 }
@@ -125,6 +156,9 @@ void bind(nb::module_& m, const char* name) {
       .def("log_evidence", &log_evidence<D>, nb::arg("a"), nb::arg("b"),
            "Log marginal likelihood of the counts in nats: the occupancy of each cell has the "
            "prior Beta(a, b) and is integrated out.")
+      .def("evidence_gain", &evidence_gain<D>, nb::arg("other"), nb::arg("a"), nb::arg("b"),
+           "Nats by which a map of the counts of both grids has more evidence, as of "
+           "`log_evidence`, than a map of each.")
       .def("bounding_box", &box_of<D>,
            "first_cell (D,) int64 and shape of the bounding box of observed cells, as returned by "
            "`dense`.")

@@ -137,16 +137,25 @@ def test_inconsistent_closure_is_rejected(spacing):
     rejected = [c.rejected for c in reject_inconsistent(context, chain, closures(shifts))]
     assert rejected == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
     (single,) = reject_inconsistent(context, chain, closures([0.1]))
-    assert single.rejected
+    assert not single.rejected
 
 
-def test_closures_agree_with_none_beyond_a_break():
+def test_the_more_likely_of_closures_that_disagree_are_kept():
     context = straight_context()
-    chain = odometry_constraints(context, OPTIONS.odometry, [25])
-    rejected = [c.rejected for c in reject_inconsistent(context, chain, closures([0.5] * 8))]
-    assert not any(rejected)
-    rejected = [c.rejected for c in reject_inconsistent(context, chain, closures([0.5] * 5))]
-    assert [bool(reason) for reason in rejected] == [False] * 4 + [True]
+    chain = odometry_constraints(context, OPTIONS.odometry, [])
+    first, *others = closures([0.5, -0.5, -0.5, -0.5])
+    for score, kept in ((2.0, False), (4.0, True)):
+        weighed = [dataclasses.replace(first, score=score), *others]
+        accepted = [not c.rejected for c in reject_inconsistent(context, chain, weighed)]
+        assert accepted == [kept, *[not kept] * 3]
+
+
+def test_closures_disagree_with_none_beyond_a_break():
+    context, shifts = straight_context(), [0.5] * 4 + [-0.5]
+    for breaks, kept in (([], False), ([25], True)):
+        chain = odometry_constraints(context, OPTIONS.odometry, breaks)
+        rejected = [c.rejected for c in reject_inconsistent(context, chain, closures(shifts))]
+        assert [not reason for reason in rejected] == [*[True] * 4, kept]
 
 
 def test_leap_from_odometry_widens_the_constraint():

@@ -11,8 +11,9 @@ from stillmap.core import se2
 from stillmap.sim.walls import box
 from stillmap.slam import loop_candidates, loop_verification
 from stillmap.slam.loop_verification import (
+    Submap,
     _select_comparable,
-    build_submap,
+    _View,
     verify_candidate,
     verify_candidates,
 )
@@ -33,11 +34,11 @@ def over_the_wall(context):
     x, off, chi = se2.parameters(context.poses), [], []
     south = [k for k in context.keyframes if context.travelled[k] < 16.0]
     north = [k for k in context.keyframes if context.travelled[k] > 28.0]
-    grid = build_submap(context, 8.0)
+    submap = Submap(context, 8.0)
     for k in north:
         i = min(south, key=lambda i: np.linalg.norm(x[i, :2] - x[k, :2]))
         T = se2.inverse(context.poses[i]) @ context.poses[k]
-        closure = verify_candidate(context, grid, LoopCandidate(i, k, T, 0.0), 0.2, 0.02)
+        closure = verify_candidate(context, submap, LoopCandidate(i, k, T, 0.0), 0.2, 0.02)
         if not closure.rejected:
             d = se2.parameters(se2.inverse(T) @ closure.T)
             off.append(d)
@@ -101,10 +102,11 @@ def test_comparable_beams_were_observed_from_the_same_side():
     once = np.array([True]), np.ones(1, np.float32), np.array([0, 1])
     _core.add_beams(grid, ends[:1], *once, T, remove=False)
     weights = np.array([0.5, 0.3, 0.2], np.float32)
-    view = make_scan(ends, weights, np.eye(3))
+    hits = make_scan(ends, weights, np.eye(3))
     # from the left, from the right, and where nobody looked
     before = ends + np.array([[-1, 0], [1, 0], [-1, 0]], np.float32)
-    part, share = _select_comparable(grid, view, before, np.eye(3))
+    view = _View([0], np.eye(3)[None], hits, before)
+    part, share = _select_comparable(grid, view, np.eye(3))
     np.testing.assert_array_equal(part.weights, np.array([0.5, 0.0, 0.0], np.float32))
     assert share == pytest.approx(0.5)
-    assert part.points is view.points
+    assert part.points is hits.points

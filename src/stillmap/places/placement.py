@@ -33,6 +33,7 @@ _USUAL_EXPLAINED = 0.9  # share of a scan that its own session's map explains
 # explained share of the comparable beams from which on a keyframe fits, and below which it
 # contradicts; comparable is what the other session observed from the same side
 _FITS, _CONTRADICTS = 0.6, 0.4
+_MIN_COMPARABLE = 0.3  # share of a view that the submap must have observed
 _RESOLUTION, _KEYFRAME_DISTANCE = 0.05, 1.0  # m, of submaps
 
 
@@ -88,15 +89,15 @@ def match_sessions(
         )
     out = []
     for stretch, members in sorted(by_stretch.items()):
-        submap = loop_verification.build_submap(context, stretch * loop_verification.SUBMAP_TRAVEL)
+        submap = loop_verification.Submap(context, stretch * loop_verification.SUBMAP_TRAVEL)
         for node, nearest in members:
             earlier, later = int(reference.nodes[nearest]), K + int(session.nodes[node])
             T = se2.inverse(context.poses[earlier]) @ context.poses[later]
             closure = loop_verification.verify_candidate(
-                context, submap, LoopCandidate(earlier, later, T, 0.0), *std, _FITS
+                context, submap, LoopCandidate(earlier, later, T, 0.0), *std
             )
             occluded = scan_matching.occluded_share(
-                submap, context.hits(later), context.poses[earlier] @ closure.T
+                submap.grid, context.hits(later), context.poses[earlier] @ closure.T
             )
             out.append(_judge(node, nearest, closure, occluded))
     return sorted(out, key=lambda match: match.node)
@@ -153,10 +154,10 @@ def _pair_nodes(
 
 def _judge(node: int, nearest: int, closure: LoopClosure, occluded: float) -> KeyframeMatch:
     verdict = Verdict.UNKNOWN
-    if closure.comparable >= loop_verification.MIN_COMPARABLE:
+    if closure.comparable >= _MIN_COMPARABLE:
         if occluded > scan_matching.MAX_OCCLUDED or closure.explained < _CONTRADICTS:
             verdict = Verdict.CONTRADICTS
-        elif not closure.rejected:
+        elif not closure.rejected and closure.explained >= _FITS:
             verdict = Verdict.FITS
     return KeyframeMatch(node, nearest, closure, verdict)
 

@@ -238,10 +238,8 @@ def _to_constraint(keyframes: Index, closure: LoopClosure) -> Constraint:
     return Constraint(int(first), int(second), closure.T, closure.covariance)
 
 
-# keyframes on the earlier and the later side that count as nearby, closures nearby that must agree,
-# chi-square up to which two agree
-_NEARBY = np.array([8, 4])
-_MIN_AGREEING, _MAX_AGREEMENT_CHI2 = 2, 9.0
+# keyframes on the earlier and the later side that count as nearby; chi-square up to which two agree
+_NEARBY, _MAX_AGREEMENT_CHI2 = np.array([8, 4]), 9.0
 
 
 def reject_inconsistent(
@@ -249,15 +247,15 @@ def reject_inconsistent(
 ) -> list[LoopClosure]:
     """Rejects closures whose correction those nearby do not share.
 
-    At least `_MIN_AGREEING` closures nearby and half of them all must agree.
+    Those that agree must be more likely than those that do not, itself included.
     """
     accepted = _AcceptedLoops(context, chain, closures)
     out, n = [], 0
     for closure in closures:
         if not closure.rejected:
             others = accepted.nearby(n)
-            n_agreeing = np.count_nonzero(accepted.agree(n, others))
-            if n_agreeing < max(_MIN_AGREEING, len(others) / 2):
+            sign = np.where(accepted.agree(n, others), 1.0, -1.0)
+            if closure.score + sign @ accepted.score[others] < 0.0:
                 closure = closure.reject("nearby closures disagree")
             n += 1
         out.append(closure)
@@ -290,6 +288,7 @@ class _AcceptedLoops:
     """Loop closures that are not rejected, as arrays.
 
     Attributes:
+        score: (L,) as of LoopClosure.
         scans, keyframes: (L, 2) earlier and later scan, and their keyframes' indices.
         T: (L, 3, 3) as of LoopClosure.
         P_earlier, P_later: (L, 3, 3) T_map_base of the scans by the context.
@@ -305,6 +304,7 @@ class _AcceptedLoops:
         scans = np.array([[c.earlier, c.later] for c in accepted], np.intp).reshape(-1, 2)
         self.scans = scans
         self.T = np.array([c.T for c in accepted]).reshape(-1, 3, 3)
+        self.score = np.array([c.score for c in accepted])
         self.covariance = np.array([c.covariance for c in accepted]).reshape(-1, 3, 3)
         self.keyframes = np.searchsorted(context.keyframes, scans)
         self.accumulated = _accumulate_covariance(context, chain)[self.keyframes]

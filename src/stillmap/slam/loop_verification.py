@@ -1,7 +1,9 @@
 """Loop verification in 2D: a keyframe is matched with a submap of earlier travel."""
 
 import dataclasses
+import functools
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
 from stillmap.slam.loop_candidates import drift_std
 from stillmap.slam.scan_hits import Scan, transform_points
+from stillmap.slam.trajectory_cost import LOOKALIKE_COST, same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 SUBMAP_TRAVEL = 8.0  # m of travel to either side that forms a submap
@@ -21,14 +24,9 @@ _SUBMAP_SPACING = 0.25  # of that between keyframes; denser takes longer without
 _VIEW_TRAVEL, _VIEW_SPACING, _MIN_ISOTROPY = (1.0, 2.0, 4.0), 1.0, 0.15
 _INDEPENDENT_SCANS = 3  # of a view: further ones add no certainty
 SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
-# a beam is comparable if the submap was observed so many m before its end; share of beams that must
-# be comparable
-_OBSERVED_MARGIN, MIN_COMPARABLE = 1.0, 0.3
-# share of the comparable beams that the submap must explain, and of the share that the local map
-# explained
-MIN_EXPLAINED, _MIN_EXPLAINED_RATIO = 0.5, 0.65
-# the first of them in wide windows; std, m, from which a window is wider and at which it is wide
-_MIN_EXPLAINED_WIDE, _WIDE_WINDOW = 0.85, (0.3, 1.0)
+_OBSERVED_MARGIN = 1.0  # m before the end of a beam where the submap must be observed
+MIN_EXPLAINED = 0.5  # share of the comparable beams that the submap must explain
+_MIN_SCORE = 14.0  # nats in favour of a closure: one in a million may be false
 CLOSURE_TRANSLATION, CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
 # a view is matched again while the comparable beams change by more than this share, at most
 _MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
@@ -45,7 +43,7 @@ def verify_candidates(
         by_stretch.setdefault(stretch, []).append(candidate)
     found = []
     for stretch, of_stretch in sorted(by_stretch.items()):
-        submap = build_submap(context, stretch * SUBMAP_TRAVEL)
+        submap = Submap(context, stretch * SUBMAP_TRAVEL)
         found += [
             verify_candidate(context, submap, one, *_total_std(one.drift_distance, one.blind_std))
             for one in of_stretch
@@ -60,31 +58,34 @@ def _total_std(metres: float, blind_std: tuple[float, float]) -> tuple[float, fl
     return float(np.hypot(translation, blind_std[0])), float(np.hypot(rotation, blind_std[1]))
 
 
-def _min_explained(translation_std: float) -> float:
-    """Share that a submap must explain: in a wide window, more places fit by chance."""
-    low, high = _WIDE_WINDOW
-    width = min(max((translation_std - low) / (high - low), 0.0), 1.0)
-    return MIN_EXPLAINED + width * (_MIN_EXPLAINED_WIDE - MIN_EXPLAINED)
+class Submap:
+    """Map of the scans around `center` m of travel.
 
+    Attributes:
+        grid: for registration.
+    """
 
-def build_submap(context: LoopContext, center: float) -> _core.OccupancyGrid2D:
-    """Map of the scans around `center` m of travel."""
-    first, last = np.searchsorted(
-        context.travelled, [center - SUBMAP_TRAVEL, center + SUBMAP_TRAVEL]
-    )
-    spacing = _SUBMAP_SPACING * context.keyframe_distance, _SUBMAP_SPACING * KEYFRAME_ANGLE
-    sensor = context.recording.sensor[first:last]
-    scans = first + select_keyframes_per_sensor(context.poses[first:last], sensor, *spacing)
-    return context.build_map(scans)
+    def __init__(self, context: LoopContext, center: float) -> None:
+        ends = center - SUBMAP_TRAVEL, center + SUBMAP_TRAVEL
+        first, last = np.searchsorted(context.travelled, ends)
+        spacing = _SUBMAP_SPACING * context.keyframe_distance, _SUBMAP_SPACING * KEYFRAME_ANGLE
+        sensor = context.recording.sensor[first:last]
+        scans = first + select_keyframes_per_sensor(context.poses[first:last], sensor, *spacing)
+        self.grid = context.build_map(scans)
+        self._context, self._scans = context, scans
+
+    @functools.cached_property
+    def counts(self) -> _core.OccupancyGrid2D:
+        """The counts (10), without end points interpolated between beams: these are no evidence."""
+        return self._context.count_beams(self._scans, self._context.poses[self._scans])
 
 
 def verify_candidate(
     context: LoopContext,
-    submap: _core.OccupancyGrid2D,
+    submap: Submap,
     candidate: LoopCandidate,
     translation_std: float,
     rotation_std: float,
-    min_explained: float | None = None,
 ) -> LoopClosure:
     """The view of the later scan matched with a submap, within its drift.
 
@@ -93,32 +94,34 @@ def verify_candidate(
         submap: map around the earlier scan.
         candidate: the scans and their relative pose.
         translation_std, rotation_std: of that pose, m and rad.
-        min_explained: share of the comparable beams; None: the wider the window, the more.
     """
-    if min_explained is None:
-        min_explained = _min_explained(translation_std)
     earlier, later = candidate.earlier, candidate.later
     mean = context.poses[earlier] @ candidate.T
     prior = motion_model.gaussian_prior(mean, translation_std, rotation_std)
-    view, before = _collect_view(context, later)
+    view = _collect_view(context, later)
     window = SEARCH_STDS * translation_std, min(SEARCH_STDS * rotation_std, np.pi)
-    part, share = _select_comparable(submap, view, before, prior.T_map_base)
+    grid = submap.grid
+    part, share = _select_comparable(grid, view, prior.T_map_base)
     for _ in range(_MAX_ROUNDS):
-        match = scan_matching.search_pose(submap, part, prior, *window)
-        here, share = _select_comparable(submap, view, before, match.T_map_base)
-        if np.abs(here.weights - part.weights).sum() < _MAX_CHANGE * view.weights.sum():
+        match = scan_matching.search_pose(grid, part, prior, *window)
+        here, share = _select_comparable(grid, view, match.T_map_base)
+        if np.abs(here.weights - part.weights).sum() < _MAX_CHANGE * view.hits.weights.sum():
             break
         part = here
     floor = [CLOSURE_TRANSLATION] * 2 + [CLOSURE_ROTATION]
     covariance = match.covariance + np.diag(np.square(floor))
-    too_little = share < MIN_COMPARABLE or match.explained < max(
-        min_explained, _MIN_EXPLAINED_RATIO * context.explained[later]
-    )
-    if not too_little:
+    score, rejected = 0.0, "explains too little"
+    if match.explained >= MIN_EXPLAINED:
+        own = context.count_beams(view.scans, match.T_map_base @ view.to_keyframe)
+        of_motion = dataclasses.replace(match, covariance=covariance)
+        score = same_place_evidence(submap.counts, own) - LOOKALIKE_COST * len(view.scans)
+        score -= scan_matching.motion_cost(prior, of_motion)
+        rejected = "" if score > _MIN_SCORE else "too little evidence"
+    if not rejected:
         # bounded by the drift over the whole way: the graph is no independent measurement
         way = context.travelled[later] - context.travelled[earlier]
         free = _total_std(way, candidate.blind_std)[0]
-        covariance += _sliding_covariance(submap, part, match.T_map_base, covariance, free)
+        covariance += _sliding_covariance(grid, part, match.T_map_base, covariance, free)
         covariance += _ambiguity_covariance(match.alternatives)
     return LoopClosure(
         earlier,
@@ -126,29 +129,46 @@ def verify_candidate(
         se2.inverse(context.poses[earlier]) @ match.T_map_base,
         se2.rotate_covariance(covariance, se2.inverse(match.T_map_base)),
         match.explained,
-        "explains too little" if too_little else "",
+        rejected,
         share,
+        score,
     )
 
 
-def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Float32]:
-    """Hits of a keyframe and of scans to either side, in its frame; and points before their ends.
+class _View(NamedTuple):
+    """A keyframe and scans to either side.
+
+    Attributes:
+        scans: of the view.
+        to_keyframe: (S, 3, 3) their poses in the frame of the keyframe.
+        hits: in that frame.
+        before_ends: (N, 2) points before their ends, see `_points_before_ends`.
+    """
+
+    scans: list[int]
+    to_keyframe: Float
+    hits: Scan
+    before_ends: Float32
+
+
+def _collect_view(context: LoopContext, t: int) -> _View:
+    """The view of a keyframe.
 
     A view of a single wall could slide along it: it grows until surfaces of other directions are in
-    it. The points are (N, 2), see `_points_before_ends`.
+    it.
     """
     for metres in _VIEW_TRAVEL:
         scans = _select_around(context, t, metres)
         seen = [context.hits(s) for s in scans]
         to_t = se2.inverse(context.poses[t]) @ context.poses[scans]
-        view = _merge_scans(seen, to_t)
-        if _isotropy(view) >= _MIN_ISOTROPY:
+        hits = _merge_scans(seen, to_t)
+        if _isotropy(hits) >= _MIN_ISOTROPY:
             break
     before = [
         transform_points(_points_before_ends(scan, _OBSERVED_MARGIN), T)
         for scan, T in zip(seen, to_t, strict=True)
     ]
-    return view, np.concatenate(before)
+    return _View(scans, to_t, hits, np.concatenate(before))
 
 
 def _select_around(context: LoopContext, t: int, metres: float) -> list[int]:
@@ -197,17 +217,18 @@ def _points_before_ends(scan: Scan, metres: float) -> Float32:
 
 
 def _select_comparable(
-    submap: _core.OccupancyGrid2D, view: Scan, before: Float32, T_map_base: Float
+    submap: _core.OccupancyGrid2D, view: _View, T_map_base: Float
 ) -> tuple[Scan, float]:
     """The part of a view that the submap observed from the same side, and its share.
 
     The other beams are no evidence and would bias the match: the back of a wall is not its front.
     """
-    cells = np.floor(transform_points(before, T_map_base) / submap.resolution).astype(np.int64)
+    before = transform_points(view.before_ends, T_map_base)
+    cells = np.floor(before / submap.resolution).astype(np.int64)
     observed = submap.alpha_beta(cells).sum(axis=1) > 0.0
-    part = np.where(observed, view.weights, np.float32(0.0))
-    share = float(part.sum()) / max(float(view.weights.sum()), 1e-9)
-    return dataclasses.replace(view, weights=part), share
+    part = np.where(observed, view.hits.weights, np.float32(0.0))
+    share = float(part.sum()) / max(float(view.hits.weights.sum()), 1e-9)
+    return dataclasses.replace(view.hits, weights=part), share
 
 
 def _ambiguity_covariance(alternatives: Float) -> Float:

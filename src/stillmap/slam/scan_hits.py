@@ -1,7 +1,7 @@
 """The hits of a scan as registration takes them, and their part in maps for registration."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -100,6 +100,27 @@ def add_hits(
     _core.interpolate_end_points(
         grid, points, hit, weights, np.array([0, len(hit)]), T, **INTERPOLATION, remove=remove
     )
+
+
+def count_beams(
+    recording: Recording, e: Float32, scans: Iterable[int], poses: Float, resolution: float
+) -> _core.OccupancyGrid2D:
+    """The counts (10) of some scans.
+
+    Args:
+        recording: 2D.
+        e: (M,) P(static) of every beam.
+        scans: (n,) that are added to the map.
+        poses: (n, 3, 3) of their robot.
+        resolution: m of a cell.
+    """
+    grid = _core.OccupancyGrid2D(resolution, moments=False)
+    for t, pose in zip(recording.iter_scans(scans, e), poses, strict=True):
+        beams = recording.beams_of(t)
+        points, hit = recording.points[beams], recording.hit[beams]
+        T = pose @ recording.T_base_sensor[recording.sensor[t]]
+        _core.add_beams(grid, points, hit, e[beams], np.array([0, len(hit)]), T[None])
+    return grid
 
 
 def replace_weights(

@@ -10,21 +10,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Index
 from stillmap.slam import loop_verification, scan_matching
 from stillmap.slam.loop_candidates import drift_std
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.trajectory_cost import count_beams, map_evidence
+from stillmap.slam.trajectory_cost import same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 _MAX_QUERIES = 8  # keyframes of a segment that are matched
 _MAX_PLACES = 8  # places that each of them is matched with
 _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
-# prior Beta(a, b) of the occupancy of a cell: that both maps are free there says next to nothing
-_PRIOR = 0.02, 0.5
 # nats of a place where odometry does not lead: robots are carried at one gap in 10^6, to any of
 # 10^8 poses; and per tested keyframe, for unknown parts of a building look like those of the map
 _CARRIED_COST, _LOOKALIKE_COST = 32.0, 8.0
@@ -80,9 +77,8 @@ class Segment:
         self._tested = _select_evenly(self._keyframes, _MAX_TESTED)
         scans = context.recording.iter_scans(self._earlier.tolist(), context.e)
         self._map = context.build_map(scans)
-        self._counts_before = self._count(self._earlier.tolist(), context.poses[self._earlier])
-        alone = self._count(self._tested, context.poses[self._tested])
-        self._apart = sum(map_evidence(grid, _PRIOR) for grid in (self._counts_before, alone))
+        # without end points interpolated between beams, which would count as evidence
+        self._counts = context.count_beams(self._earlier, context.poses[self._earlier])
 
     def follow_odometry(self) -> Placement:
         """The segment where odometry leads, within its covariance."""
@@ -141,18 +137,9 @@ class Segment:
                     moved = match.T_map_base @ se2.inverse(context.poses[t])
                     spread = np.zeros((3, 3))
                     C_first = moved if C_first is None else C_first
-        gain = self._gain(np.array([poses[t] for t in self._tested]))
+        own = context.count_beams(self._tested, np.array([poses[t] for t in self._tested]))
+        gain = same_place_evidence(self._counts, own)
         return Placement(C if C_first is None else C_first, C_first is not None, gain, cost)
-
-    def _count(self, scans: list[int], poses: Float) -> _core.OccupancyGrid2D:
-        context = self._context
-        return count_beams(context.recording, context.e, scans, poses, context.resolution)
-
-    def _gain(self, poses: Float) -> float:
-        """Nats of the map with the tested keyframes at poses (n, 3, 3), over that of each apart."""
-        together = self._count(self._tested, poses)
-        together.merge(self._counts_before)
-        return map_evidence(together, _PRIOR) - self._apart
 
     def _odometry_cost(self, C: Float) -> float:
         """Nats of a motion (3, 3) of the segment under odometry."""
@@ -173,12 +160,12 @@ class Segment:
             distance = np.abs(signatures - _range_signature(context, later)).sum(axis=1)
             for stretch in _nearest_stretches(stretches, distance):
                 if stretch not in submaps:
-                    submaps[stretch] = loop_verification.build_submap(context, stretch * length)
+                    submaps[stretch] = loop_verification.Submap(context, stretch * length)
                 same = np.flatnonzero(stretches == stretch)
                 earlier = int(before[same[np.argmin(distance[same])]])
                 candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
                 closure = loop_verification.verify_candidate(
-                    context, submaps[stretch], candidate, *std, loop_verification.MIN_EXPLAINED
+                    context, submaps[stretch], candidate, *std
                 )
                 if not closure.rejected:
                     yield closure

@@ -18,11 +18,9 @@ from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.slam import local_map, scan_hits
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.trajectory_cost import OdometryCost, count_beams, map_evidence
+from stillmap.slam.trajectory_cost import OdometryCost, map_evidence
 from stillmap.slam.types import MStepResult
 
-# prior Beta(a, b) of the occupancy of a cell: most cells are free, few are anything in between
-_PRIOR = 0.1, 0.5
 # m of travel and scans on both sides, at least: that are matched again, and that are compared, as
 # far as the local map reaches
 _MATCHED_AGAIN, _COMPARED = (10.0, 8), (25.0, 10)
@@ -240,9 +238,10 @@ class _Comparison:
         """-ln of the evidence of the map of spaced scans from `first` on at poses (n, 3, 3)."""
         within = np.searchsorted(self.kept, [first, first + len(poses)])
         scans = self.kept[slice(*within)]
-        resolution = self.options.resolution
-        grid = count_beams(self.recording, self.e, scans, poses[scans - first], resolution)
-        return -map_evidence(grid, _PRIOR)
+        grid = scan_hits.count_beams(
+            self.recording, self.e, scans, poses[scans - first], self.options.resolution
+        )
+        return -map_evidence(grid)
 
     def _close_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
         """Poses of the scans from first to last - 1 with the loops among them closed."""

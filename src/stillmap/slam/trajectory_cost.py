@@ -1,53 +1,39 @@
 """Cost of a trajectory in nats: -ln of the evidence of its map, and of its steps given odometry."""
 
-from collections.abc import Iterable
-
 import numpy as np
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.core.array_types import Float, Float32
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
 
+# prior Beta(a, b) of the occupancy of a cell: most are free, few are anything in between; and of
+# cells of two maps that may overlap
+_PRIOR, _SAME_PLACE_PRIOR = (0.1, 0.5), (0.02, 0.5)
+LOOKALIKE_COST = 14.0  # nats per scan of a place: unknown ones look like those of the map
 _RECOVERY_COST = 2.3  # nats: odometry that failed is valid again after ten scans
 
 
-def map_evidence(grid: _core.OccupancyGrid2D, prior: tuple[float, float]) -> float:
+def map_evidence(grid: _core.OccupancyGrid2D) -> float:
     """ln of the marginal likelihood of the counts (10), times the gain of dependent beams.
 
     The occupancy of each cell is integrated out: beams that end in free space or pass through walls
     cost, and so does every new cell, and a place that is mapped twice.
-
-    Args:
-        grid: the counts.
-        prior: a, b of the Beta distribution of the occupancy of a cell.
     """
-    evidence: float = INFORMATION_SCALE * grid.log_evidence(*prior)
+    evidence: float = INFORMATION_SCALE * grid.log_evidence(*_PRIOR)
     return evidence
 
 
-def count_beams(
-    recording: Recording, e: Float32, scans: Iterable[int], poses: Float, resolution: float
-) -> _core.OccupancyGrid2D:
-    """The counts (10) of some scans.
+def same_place_evidence(grid: _core.OccupancyGrid2D, other: _core.OccupancyGrid2D) -> float:
+    """Nats by which one map of the counts of both grids has more evidence than one of each.
 
-    Args:
-        recording: 2D.
-        e: (M,) P(static) of every beam.
-        scans: (n,) that are added to the map.
-        poses: (n, 3, 3) of their robot.
-        resolution: m of a cell.
+    That both are free there says next to nothing: the prior expects it.
     """
-    grid = _core.OccupancyGrid2D(resolution, moments=False)
-    for t, pose in zip(recording.iter_scans(scans, e), poses, strict=True):
-        beams = recording.beams_of(t)
-        points, hit = recording.points[beams], recording.hit[beams]
-        T = pose @ recording.T_base_sensor[recording.sensor[t]]
-        _core.add_beams(grid, points, hit, e[beams], np.array([0, len(hit)]), T[None])
-    return grid
+    evidence: float = INFORMATION_SCALE * grid.evidence_gain(other, *_SAME_PLACE_PRIOR)
+    return evidence
 
 
 class OdometryCost:

@@ -49,6 +49,7 @@ class LoopClosure(ShortRepr):
         explained: share of the comparable beams of the later scan that the earlier map explains.
         rejected: reason of the rejection; empty if accepted.
         comparable: share of the later scan that the earlier map observed from the same side.
+        score: in 2D, nats by which it is more likely that both see the same place than not.
     """
 
     earlier: int
@@ -58,6 +59,7 @@ class LoopClosure(ShortRepr):
     explained: float
     rejected: str = ""
     comparable: float = 1.0
+    score: float = 1.0
 
     def reject(self, reason: str) -> "LoopClosure":
         """The same closure, rejected."""
@@ -170,3 +172,7 @@ class LoopContext:
         for t in scans:
             scan_hits.add_scan(grid, self.recording, self.e, t, self.poses[t])
         return grid
+
+    def count_beams(self, scans: Iterable[int], poses: Float) -> _core.OccupancyGrid2D:
+        """The counts (10) of some of the scans, at poses (n, 3, 3)."""
+        return scan_hits.count_beams(self.recording, self.e, scans, poses, self.resolution)
