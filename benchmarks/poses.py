@@ -123,7 +123,7 @@ ABLATION = (
     DEFAULTS,
     Variant("no loops", ("slam.loop_closure=false",)),
     Variant("no e: the first M-step", ("em.max_iterations=1",)),
-    Variant("loops need no others that agree", constants={"loop_closure._MIN_AGREEING": 0}),
+    Variant("loops nearby need not agree", constants={"loop_closure._MAX_AGREEMENT_CHI2": 1e9}),
     Variant("every loop is believed", constants={"loop_closure._MAX_CHI2": 1e9}),
     Variant("no annealing", constants={"pose_graph._ANNEALING_STEPS": 1}),
     Variant("no refinement pass", constants={"m_step._REFINEMENT_PASSES": 0}),
