@@ -23,8 +23,9 @@ _MAX_PLACES = 8  # places that each of them is matched with
 _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
 # nats of a place where odometry does not lead: robots are carried at one gap in 10^6, to any of
-# 10^8 poses; and per tested keyframe, for unknown parts of a building look like those of the map
-_CARRIED_COST, _LOOKALIKE_COST = 32.0, 8.0
+# 10^8 poses, and a wrong place tears the map; and per tested keyframe, for unknown parts of a
+# building look like those of the map
+_CARRIED_COST, _LOOKALIKE_COST = 60.0, 8.0
 _MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 
