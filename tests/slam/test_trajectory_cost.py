@@ -1,14 +1,16 @@
-"""Cost of steps given odometry: the likeliest states of a hidden Markov model."""
+"""Cost of steps given odometry, and evidence of maps, against plain twins."""
 
 import itertools
 
 import numpy as np
 import pytest
 from rooms import drive
+from scipy.special import betaln
 from scipy.stats import norm
 
+from stillmap import _core
 from stillmap.core import se2
-from stillmap.slam import motion_model, trajectory_cost
+from stillmap.slam import motion_model, scan_hits, trajectory_cost
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.scan_matching import FAULT_COST
 
@@ -56,3 +58,27 @@ def test_motion_at_constant_velocity_is_less_certain_over_longer_times():
     std = motion_model.onward_std(np.array([0, 1e8, 4e8, 14e8], np.int64))
     assert (np.diff(std, axis=0) >= 0.0).all()
     assert std[0, 0] < std[2, 0]
+
+
+def test_evidence_gain_is_that_of_beta_distributions():
+    simulation = drive(2, robot={"scans": 20})
+    recording, poses = simulation.recording, simulation.truth.T_world_base
+    e = np.random.default_rng(0).uniform(size=recording.n_beams).astype(np.float32)
+    halves = np.split(np.arange(len(poses)), [12])
+    first, second = (scan_hits.count_beams(recording, e, k, poses[k], 0.1) for k in halves)
+    together = scan_hits.count_beams(recording, e, range(len(poses)), poses, 0.1)
+    counts = [np.array(grid.dense(*together.bounding_box())[1:]) for grid in (first, second)]
+    both = ((counts[0].sum(axis=0) > 0.0) & (counts[1].sum(axis=0) > 0.0)).sum()
+    assert both > 100  # cells
+    for a, b in ((0.02, 0.5), (2.0, 1.0)):
+        evidence = [
+            (betaln(alpha + a, beta + b) - betaln(a, b)).sum()
+            for alpha, beta in (sum(counts), *counts)
+        ]
+        expected = evidence[0] - evidence[1] - evidence[2]
+        assert first.evidence_gain(second, a, b) == pytest.approx(expected, rel=1e-9)
+        assert second.evidence_gain(first, a, b) == pytest.approx(expected, rel=1e-9)
+    with pytest.raises(ValueError, match="resolution"):
+        first.evidence_gain(_core.OccupancyGrid2D(0.05), 1.0, 1.0)
+    with pytest.raises(ValueError, match="pseudo-counts"):
+        first.evidence_gain(second, 0.0, 1.0)

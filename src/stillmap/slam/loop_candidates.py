@@ -198,8 +198,8 @@ def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) ->
     if recording.T_odom_base is None:
         return leaps
     increments = se2.increments(recording.T_odom_base)
-    found = se2.increments(poses)
-    difference = se2.parameters(se2.inverse(increments) @ found)
+    matched = se2.increments(poses)
+    difference = se2.parameters(se2.inverse(increments) @ matched)
     std = motion_model.increment_std(increments, options)[:, [0, 0, 1]]
     is_leap = np.linalg.norm(difference / std, axis=1) > _LEAP_STDS
     leaps[1:][is_leap] = difference[is_leap]

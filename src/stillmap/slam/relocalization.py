@@ -39,8 +39,8 @@ class Relocalization:
         context: the trajectory with all segments in place.
         closures: that connect them.
         breaks: first scans of segments that do not follow by odometry.
-        ambiguous: first scans of segments that contradict the map where odometry leads, or would
-            fit elsewhere about as well.
+        ambiguous: first scans of segments that contradict the map where odometry leads, and fit
+            nowhere else.
     """
 
     context: LoopContext
@@ -66,7 +66,8 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         context = dataclasses.replace(context, poses=poses)
         covariance = transfer_covariance(context, covariance, previous, first)
         segment = Segment(context, first, last, covariance)
-        previous, best = first, segment.follow_odometry()
+        previous, by_odometry = first, segment.follow_odometry()
+        best = by_odometry
         if not best.is_likely:
             best = max(best, segment.find_place() or best, key=lambda placement: placement.score)
         if best.is_likely:
@@ -75,7 +76,7 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
             out.closures.extend(best.closures)
             if best.is_elsewhere:
                 out.breaks.append(first)
-        elif best.gain < 0.0:
+        elif by_odometry.gain < 0.0:
             out.ambiguous.append(first)
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
 
