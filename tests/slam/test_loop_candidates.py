@@ -43,7 +43,8 @@ def laps(n):
 
 
 def tie(earlier, later, covariance=SURE, T=None):
-    return LoopClosure(earlier, later, np.eye(3) if T is None else T, covariance, 1.0)
+    T = np.eye(3) if T is None else T
+    return LoopClosure(earlier, later, T, covariance, 1.0, score=40.0)
 
 
 def test_drift_of_candidates_follows_the_graph():

@@ -119,11 +119,11 @@ def straight_context(spacing=1.0):
     return loop_context(recording, se2.matrix(x, 0.0, 0.0), travelled, np.arange(n))
 
 
-def closures(shifts):
-    """The second time at keyframe k is the first time there, moved by shift."""
+def closures(shifts, score=70.0):
+    """The second time at keyframe k is the first time there, moved by shift; nats of each."""
     covariance = np.diag([0.03**2, 0.03**2, 0.006**2])
     return [
-        LoopClosure(k, 21 + k, se2.matrix(shift, 0.0, 0.0), covariance, 1.0)
+        LoopClosure(k, 21 + k, se2.matrix(shift, 0.0, 0.0), covariance, 1.0, score=score)
         for k, shift in enumerate(shifts)
     ]
 
@@ -136,15 +136,18 @@ def test_inconsistent_closure_is_rejected(spacing):
     shifts[4] = -0.5
     rejected = [c.rejected for c in reject_inconsistent(context, chain, closures(shifts))]
     assert rejected == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
-    (single,) = reject_inconsistent(context, chain, closures([0.1]))
-    assert not single.rejected
+    for score, refused in ((70.0, False), (50.0, True)):
+        (single,) = reject_inconsistent(context, chain, closures([0.1], score))
+        assert bool(single.rejected) == refused
+    pair = reject_inconsistent(context, chain, closures([0.1, 0.1], 50.0))
+    assert not any(closure.rejected for closure in pair)
 
 
 def test_the_more_likely_of_closures_that_disagree_are_kept():
     context = straight_context()
     chain = odometry_constraints(context, OPTIONS.odometry, [])
     first, *others = closures([0.5, -0.5, -0.5, -0.5])
-    for score, kept in ((2.0, False), (4.0, True)):
+    for score, kept in ((100.0, False), (300.0, True)):
         weighed = [dataclasses.replace(first, score=score), *others]
         accepted = [not c.rejected for c in reject_inconsistent(context, chain, weighed)]
         assert accepted == [kept, *[not kept] * 3]

@@ -14,7 +14,7 @@ from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
 from stillmap.slam.loop_candidates import drift_std
 from stillmap.slam.scan_hits import Scan, transform_points
-from stillmap.slam.trajectory_cost import LOOKALIKE_COST, same_place_evidence
+from stillmap.slam.trajectory_cost import same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 SUBMAP_TRAVEL = 8.0  # m of travel to either side that forms a submap
@@ -26,7 +26,7 @@ _INDEPENDENT_SCANS = 3  # of a view: further ones add no certainty
 SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
 _OBSERVED_MARGIN = 1.0  # m before the end of a beam where the submap must be observed
 MIN_EXPLAINED = 0.5  # share of the comparable beams that the submap must explain
-_MIN_SCORE = 14.0  # nats in favour of a closure: one in a million may be false
+_LOOKALIKE_COST = 14.0  # nats per scan of a view: unknown places look like those of the map
 CLOSURE_TRANSLATION, CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
 # a view is matched again while the comparable beams change by more than this share, at most
 _MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
@@ -114,9 +114,9 @@ def verify_candidate(
     if match.explained >= MIN_EXPLAINED:
         own = context.count_beams(view.scans, match.T_map_base @ view.to_keyframe)
         of_motion = dataclasses.replace(match, covariance=covariance)
-        score = same_place_evidence(submap.counts, own) - LOOKALIKE_COST * len(view.scans)
+        score = same_place_evidence(submap.counts, own) - _LOOKALIKE_COST * len(view.scans)
         score -= scan_matching.motion_cost(prior, of_motion)
-        rejected = "" if score > _MIN_SCORE else "too little evidence"
+        rejected = "" if score > 0.0 else "too little evidence"
     if not rejected:
         # bounded by the drift over the whole way: the graph is no independent measurement
         way = context.travelled[later] - context.travelled[earlier]

@@ -15,17 +15,16 @@ from stillmap.core.array_types import Float, Index
 from stillmap.slam import loop_verification, scan_matching
 from stillmap.slam.loop_candidates import drift_std
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.trajectory_cost import same_place_evidence
+from stillmap.slam.trajectory_cost import TEAR_COST, same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 _MAX_QUERIES = 8  # keyframes of a segment that are matched
 _MAX_PLACES = 8  # places that each of them is matched with
 _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
-# nats of a place where odometry does not lead: robots are carried at one gap in 10^6, to any of
-# 10^8 poses, and a wrong place tears the map; and per tested keyframe, for unknown parts of a
-# building look like those of the map
-_CARRIED_COST, _LOOKALIKE_COST = 60.0, 8.0
+# nats per tested keyframe of a place where odometry does not lead: unknown parts of a building look
+# like those of the map
+_LOOKALIKE_COST = 8.0
 _MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 
@@ -89,7 +88,7 @@ class Segment:
         """The most likely place at which keyframes fit, near odometry or elsewhere."""
         best: Placement | None = None
         closures = list(self._match_places())
-        carried = _CARRIED_COST + _LOOKALIKE_COST * len(self._tested)
+        carried = TEAR_COST + _LOOKALIKE_COST * len(self._tested)
         for closure in self._deduplicate(closures):
             placement = self._follow(self._motion(closure), closure.later, np.zeros((3, 3)))
             motion = self._odometry_cost(placement.C)

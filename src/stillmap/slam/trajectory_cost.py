@@ -13,7 +13,9 @@ from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
 # prior Beta(a, b) of the occupancy of a cell: most are free, few are anything in between; and of
 # cells of two maps that may overlap
 _PRIOR, _SAME_PLACE_PRIOR = (0.1, 0.5), (0.02, 0.5)
-LOOKALIKE_COST = 14.0  # nats per scan of a place: unknown ones look like those of the map
+# nats that prove that two places are the same against the harm of a torn map: one in a million may
+# be wrong, and any of 10^8 poses could be
+TEAR_COST = 60.0
 _RECOVERY_COST = 2.3  # nats: odometry that failed is valid again after ten scans
 
 

@@ -49,7 +49,7 @@ class LoopClosure(ShortRepr):
         explained: share of the comparable beams of the later scan that the earlier map explains.
         rejected: reason of the rejection; empty if accepted.
         comparable: share of the later scan that the earlier map observed from the same side.
-        score: in 2D, nats by which it is more likely that both see the same place than not.
+        score: in 2D, nats by which both are more likely to see the same place than two alike.
     """
 
     earlier: int
