@@ -54,8 +54,7 @@ ABLATION = (
     Variant(
         "a place elsewhere costs nothing",
         constants={
-            "segment_placement.TEAR_COST": 0.0,
-            "segment_placement._LOOKALIKE_COST": 0.0,
+            "segment_placement._CARRIED_COST": 0.0,
         },
     ),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),

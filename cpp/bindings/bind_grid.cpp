@@ -85,12 +85,14 @@ class CellEvidence {
   double a_, b_, of_hits_, of_both_;
 };
 
+// Free space is left out: its cells depend on each other, and all places have some.
 template <int D>
 double log_evidence(const OccupancyGrid<D>& grid, double a, double b) {
   const CellEvidence evidence(a, b);
   double sum = 0.0;
-  for_each_observed(grid,
-                    [&](const Cell<D>&, const CellCounts& c) { sum += evidence(c.alpha, c.beta); });
+  for_each_observed(grid, [&](const Cell<D>&, const CellCounts& c) {
+    if (c.alpha > 0) sum += evidence(c.alpha, c.beta);
+  });
   return sum;
 }
 
@@ -104,7 +106,7 @@ double evidence_gain(const OccupancyGrid<D>& grid, const OccupancyGrid<D>& other
   double sum = 0.0;
   for_each_observed(other, [&](const Cell<D>& cell, const CellCounts& c) {
     const CellCounts* here = cursor.find_observed(cell);
-    if (here == nullptr) return;
+    if (here == nullptr || here->alpha + c.alpha == 0) return;
     sum += evidence(here->alpha + c.alpha, here->beta + c.beta);
     sum -= evidence(here->alpha, here->beta) + evidence(c.alpha, c.beta);
   });
@@ -154,11 +156,11 @@ void bind(nb::module_& m, const char* name) {
       .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
            "(K, 2) float64: sums alpha, beta of cells (K, D) int64; 0, 0 for unobserved cells.")
       .def("log_evidence", &log_evidence<D>, nb::arg("a"), nb::arg("b"),
-           "Log marginal likelihood of the counts in nats: the occupancy of each cell has the "
-           "prior Beta(a, b) and is integrated out.")
+           "Log marginal likelihood in nats of the counts of cells with returns: the occupancy of "
+           "each has the prior Beta(a, b) and is integrated out.")
       .def("evidence_gain", &evidence_gain<D>, nb::arg("other"), nb::arg("a"), nb::arg("b"),
-           "Nats by which a map of the counts of both grids has more evidence, as of "
-           "`log_evidence`, than a map of each.")
+           "Nats by which a map of the counts of both grids has more evidence than a map of each, "
+           "as of `log_evidence`, in the cells that both observe and in which either has returns.")
       .def("bounding_box", &box_of<D>,
            "first_cell (D,) int64 and shape of the bounding box of observed cells, as returned by "
            "`dense`.")

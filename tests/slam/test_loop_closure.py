@@ -136,10 +136,10 @@ def test_inconsistent_closure_is_rejected(spacing):
     shifts[4] = -0.5
     rejected = [c.rejected for c in reject_inconsistent(context, chain, closures(shifts))]
     assert rejected == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
-    for score, refused in ((70.0, False), (50.0, True)):
+    for score, refused in ((15.0, False), (10.0, True)):
         (single,) = reject_inconsistent(context, chain, closures([0.1], score))
         assert bool(single.rejected) == refused
-    pair = reject_inconsistent(context, chain, closures([0.1, 0.1], 50.0))
+    pair = reject_inconsistent(context, chain, closures([0.1, 0.1], 10.0))
     assert not any(closure.rejected for closure in pair)
 
 

@@ -28,7 +28,7 @@ def test_log_evidence_is_that_of_beta_distributions():
     em.add_recording(grid, simulation.recording, simulation.truth.T_world_base, None)
     _, alpha, beta = grid.dense()
     for a, b in ((0.1, 0.5), (2.0, 1.0)):
-        wanted = (betaln(alpha + a, beta + b) - betaln(a, b)).sum()
+        wanted = (betaln(alpha + a, beta + b) - betaln(a, b))[alpha > 0.0].sum()
         assert grid.log_evidence(a, b) == pytest.approx(wanted, rel=1e-9)
     for a, b in ((0.0, 1.0), (1.0, -1.0), (np.nan, 1.0)):
         with pytest.raises(ValueError, match="pseudo-counts"):

@@ -20,7 +20,7 @@ from stillmap.slam import (
 from stillmap.slam.heading_alignment import align_headings
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
-from stillmap.slam.trajectory_cost import TEAR_COST
+from stillmap.slam.scan_matching import FAULT_COST
 from stillmap.slam.types import BareStretch, LoopClosure, LoopContext, MStepResult, ScanProgress
 
 KEYFRAME_DISTANCE, SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
@@ -248,7 +248,7 @@ def reject_inconsistent(
 ) -> list[LoopClosure]:
     """Rejects closures whose correction is not proved by those nearby.
 
-    The scores of those that agree, itself included, less those of the others must reach TEAR_COST.
+    The scores of those that agree, itself included, less those of the others must reach FAULT_COST.
     """
     accepted = _AcceptedLoops(context, chain, closures)
     out, n = [], 0
@@ -256,7 +256,7 @@ def reject_inconsistent(
         if not closure.rejected:
             others = accepted.nearby(n)
             sign = np.where(accepted.agree(n, others), 1.0, -1.0)
-            if closure.score + sign @ accepted.score[others] < TEAR_COST:
+            if closure.score + sign @ accepted.score[others] < FAULT_COST:
                 closure = closure.reject("nearby closures disagree")
             n += 1
         out.append(closure)

@@ -26,7 +26,6 @@ _INDEPENDENT_SCANS = 3  # of a view: further ones add no certainty
 SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
 _OBSERVED_MARGIN = 1.0  # m before the end of a beam where the submap must be observed
 MIN_EXPLAINED = 0.5  # share of the comparable beams that the submap must explain
-_LOOKALIKE_COST = 14.0  # nats per scan of a view: unknown places look like those of the map
 CLOSURE_TRANSLATION, CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
 # a view is matched again while the comparable beams change by more than this share, at most
 _MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
@@ -114,7 +113,7 @@ def verify_candidate(
     if match.explained >= MIN_EXPLAINED:
         own = context.count_beams(view.scans, match.T_map_base @ view.to_keyframe)
         of_motion = dataclasses.replace(match, covariance=covariance)
-        score = same_place_evidence(submap.counts, own) - _LOOKALIKE_COST * len(view.scans)
+        score = same_place_evidence(submap.counts, own)
         score -= scan_matching.motion_cost(prior, of_motion)
         rejected = "" if score > 0.0 else "too little evidence"
     if not rejected:

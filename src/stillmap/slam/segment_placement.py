@@ -15,16 +15,16 @@ from stillmap.core.array_types import Float, Index
 from stillmap.slam import loop_verification, scan_matching
 from stillmap.slam.loop_candidates import drift_std
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.trajectory_cost import TEAR_COST, same_place_evidence
+from stillmap.slam.trajectory_cost import same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 _MAX_QUERIES = 8  # keyframes of a segment that are matched
 _MAX_PLACES = 8  # places that each of them is matched with
 _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
-# nats per tested keyframe of a place where odometry does not lead: unknown parts of a building look
-# like those of the map
-_LOOKALIKE_COST = 8.0
+# nats of a robot that was carried: one in a million, to any of 10^8 poses; rarer than that, since
+# it tears the map if it is wrong
+_CARRIED_COST = 60.0
 _MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 
@@ -88,14 +88,13 @@ class Segment:
         """The most likely place at which keyframes fit, near odometry or elsewhere."""
         best: Placement | None = None
         closures = list(self._match_places())
-        carried = TEAR_COST + _LOOKALIKE_COST * len(self._tested)
         for closure in self._deduplicate(closures):
             placement = self._follow(self._motion(closure), closure.later, np.zeros((3, 3)))
             motion = self._odometry_cost(placement.C)
             placement = dataclasses.replace(
                 placement,
-                cost=placement.cost + min(motion, carried),
-                is_elsewhere=motion > carried,
+                cost=placement.cost + min(motion, _CARRIED_COST),
+                is_elsewhere=motion > _CARRIED_COST,
             )
             if best is None or placement.score > best.score:
                 best = placement

@@ -10,31 +10,24 @@ from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
 
-# prior Beta(a, b) of the occupancy of a cell: most are free, few are anything in between; and of
-# cells of two maps that may overlap
-_PRIOR, _SAME_PLACE_PRIOR = (0.1, 0.5), (0.02, 0.5)
-# nats that prove that two places are the same against the harm of a torn map: one in a million may
-# be wrong, and any of 10^8 poses could be
-TEAR_COST = 60.0
+_PRIOR = 0.02, 0.5  # Beta(a, b) of the occupancy of a cell: few are occupied, fewer in between
 _RECOVERY_COST = 2.3  # nats: odometry that failed is valid again after ten scans
 
 
 def map_evidence(grid: _core.OccupancyGrid2D) -> float:
     """ln of the marginal likelihood of the counts (10), times the gain of dependent beams.
 
-    The occupancy of each cell is integrated out: beams that end in free space or pass through walls
-    cost, and so does every new cell, and a place that is mapped twice.
+    The occupancy of each cell with returns is integrated out: beams that end in free space or pass
+    through walls cost, and so does every new cell, and a place that is mapped twice. Free space
+    alone is no evidence: its cells depend on each other, and all places have some.
     """
     evidence: float = INFORMATION_SCALE * grid.log_evidence(*_PRIOR)
     return evidence
 
 
 def same_place_evidence(grid: _core.OccupancyGrid2D, other: _core.OccupancyGrid2D) -> float:
-    """Nats by which one map of the counts of both grids has more evidence than one of each.
-
-    That both are free there says next to nothing: the prior expects it.
-    """
-    evidence: float = INFORMATION_SCALE * grid.evidence_gain(other, *_SAME_PLACE_PRIOR)
+    """Nats by which one map of the counts of both grids has more evidence than one of each."""
+    evidence: float = INFORMATION_SCALE * grid.evidence_gain(other, *_PRIOR)
     return evidence
 
 
