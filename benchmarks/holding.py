@@ -49,7 +49,7 @@ ABLATION = (
     Variant("odometry noise is not learned", constants={"motion_model._MIN_NOISE_SHARE": 1.0}),
     Variant(
         "one contradicting scan is a break",
-        constants={"relocalization._MIN_CONTRADICTING_SCANS": 1},
+        constants={"front_end._CARRIED_AFTER": 1.0},
     ),
     Variant(
         "a place elsewhere costs nothing",

@@ -12,10 +12,10 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.live.slip_detection import SlipDetector
-from stillmap.slam import motion_model, relocalization
+from stillmap.slam import motion_model
+from stillmap.slam.front_end import Evidence, judge_scan
 from stillmap.slam.motion_model import MotionPrior, gaussian_prior
 from stillmap.slam.options import OdometryOptions
-from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
     MIN_GAIN,
@@ -331,7 +331,7 @@ class DeadReckoning:
         alike = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
         window = _WINDOW_STDS * metres, min(_WINDOW_STDS * radians, _MAX_ROTATION)
         match = search_pose(grid, alike, wide, *window)
-        evidence = relocalization.judge_scan(grid, alike, match, usual)
+        evidence = judge_scan(grid, alike, match, usual)
         if evidence is Evidence.CONTRADICTS:
             occluded = occluded_share(grid, alike, prior.T_map_base)
             # odometry may have led the robot to where nothing is mapped

@@ -10,22 +10,19 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
 from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan
-from stillmap.live.odometry_faults import DeadReckoning, Fault, OdometryFaults, is_plausible
+from stillmap.live.odometry_faults import DeadReckoning, Fault, OdometryFaults
 from stillmap.live.scan import ScanBeams, deskew
-from stillmap.slam import motion_model, relocalization, scan_hits
+from stillmap.slam import motion_model, scan_hits
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
+from stillmap.slam.front_end import Evidence, FrontEnd
 from stillmap.slam.heading_alignment import DirectionDensity, Directions, HeadingOffset
-from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
+from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
     ScanMatch,
     accept_prior,
     is_inconsistent,
-    is_poor,
-    match_scan,
-    widen_match,
 )
 
 _MAX_REGISTERED = 600  # end points of a scan that are registered
@@ -35,12 +32,6 @@ _MIN_TRAVEL = 8.0  # m after which directions are known
 # directions, rad, which one metre of travel shows once
 _EVIDENCE, _MIN_STD = 0.1, np.radians(0.3)
 _FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
-_EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-# scans that contradict the map more than others agree, after which the robot was carried; at most
-_CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
-# of them that a scan outweighs which agrees, and one that says nothing; share of the usual
-# explained one below which nothing of a scan is in the local map, though the robot moved on
-_AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
 
 
 def select_hits(beams: ScanBeams) -> Scan:
@@ -106,11 +97,8 @@ class ScanOdometry:
         self.left_behind = self.local_map  # the one before the robot was carried
         self.travelled = 0.0
         self.crowd = Crowd()
-        self._pose, self._before = np.eye(3), np.eye(3)
+        self._front_end = FrontEnd(options.odometry)
         self._stamp_ns, self._seconds = 0, 0.0
-        self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
-        self._usual: dict[str | int, float] = {}
-        self._contradictions = 0.0
         self._reckoning = DeadReckoning()
         self._is_adrift = False  # after a blind stretch no scan showed yet where the robot is
         self._walls: WallDirections | None = WallDirections()
@@ -125,9 +113,10 @@ class ScanOdometry:
             increment: (3, 3) of odometry since the last scan; None: there is none.
         """
         if self._is_first:
-            return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
+            return motion_model.gaussian_prior(np.eye(3), 1e-3, 1e-3)
         ns, seconds = beams.stamp_ns, self._seconds_to(beams)
-        return self._faults.predict(self._pose, self._guess(), increment, ns, seconds)
+        front_end = self._front_end
+        return self._faults.predict(front_end.pose, front_end.predict(), increment, ns, seconds)
 
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
         """The hits of a scan with weight 1, without the motion that is predicted during it.
@@ -154,17 +143,17 @@ class ScanOdometry:
             increment: as of `predict`.
         """
         scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams)
-        usual = self._usual.get(beams.sensor, 0.0)
+        front_end = self._front_end
         learned = self._learned_prior(prior, increment)
-        match, is_slipping = self._match(beams, scan, prior, learned, usual)
-        is_carried = self._contradictions >= _CARRIED_AFTER
+        match, is_slipping = self._match(beams, scan, prior, learned)
+        is_carried = front_end.is_carried
         if is_carried:
             self._start_anew()
             match, is_slipping = accept_prior(prior), False
         elif not self._is_first:
             fault = self._detect_fault(beams, scan, prior, match)
             if fault is not None:
-                self._pose, match = fault.before, fault.match
+                front_end.pose, match = fault.before, fault.match
                 learned = self._learned_prior(prior, increment)  # the last pose has changed
             is_rejected = increment is not None and not prior.is_odometry
             is_slipping = is_slipping or fault is not None or is_rejected
@@ -173,14 +162,15 @@ class ScanOdometry:
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0 or self._is_adrift
         learned = learned or prior
         drift = motion_model.blind_drift(learned, match.covariance)
-        if not (is_blind or self._contradictions or self._reckoning.is_far):
-            self._learn(beams, learned, match, usual)
+        is_known = not (is_blind or self._is_contradicted or self._reckoning.is_far)
+        if is_known and self.local_map.has_sensor(beams.sensor):
+            front_end.learn(beams.sensor, learned, match, self._seconds)
         if is_blind:
-            self._reckoning.move(self._pose, match.T_map_base, drift)
+            self._reckoning.move(front_end.pose, match.T_map_base, drift)
         else:
             self._reckoning.reset()
         self._advance(beams, match.T_map_base)
-        is_contradicted = self._contradictions > 0.0 or self._is_adrift
+        is_contradicted = self._is_contradicted or self._is_adrift
         doubts = is_slipping, is_blind, is_carried, is_contradicted, prior.is_odometry
         T, covariance = match.T_map_base, match.covariance + self._reckoning.covariance
         return Registration(T, covariance, match.explained, drift, twist, *doubts)
@@ -197,9 +187,9 @@ class ScanOdometry:
             recent: (N,) the same with the prior of what was only just seen, for the local map.
             label: labels an earlier scan again, after a second.
         """
-        if self._contradictions > 0.0 or self._is_adrift:
+        if self._is_contradicted or self._is_adrift:
             return None
-        scan = MappedScan(beams, e, self._pose, self.travelled)
+        scan = MappedScan(beams, e, self._front_end.pose, self.travelled)
         added = self.local_map.add(replace(scan, e=recent))
         most = math.inf if self._seconds >= _FAST else float(not added)
         self.local_map.tend(beams.stamp_ns, self.travelled, label, most)
@@ -208,8 +198,9 @@ class ScanOdometry:
     def enter(self, local_map: Any, T: Float) -> None:
         """Go on in another map, in whose frame the frame so far has the pose T (3, 3)."""
         self.local_map = local_map
-        self._pose, self._before = T @ self._pose, T @ self._before
-        self._contradictions = 0.0
+        front_end = self._front_end
+        front_end.pose, front_end.before = T @ front_end.pose, T @ front_end.before
+        front_end.agree()
         self._reckoning.reset()
         self._walls = None  # that map has the heading
 
@@ -226,7 +217,7 @@ class ScanOdometry:
         if self._walls is None:
             return match
         T = match.T_map_base
-        metres = 0.0 if self._is_first else float(np.hypot(*(T[:2, 2] - self._pose[:2, 2])))
+        metres = 0.0 if self._is_first else float(np.hypot(*(T - self._front_end.pose)[:2, 2]))
         offset = self._walls.measure(scan, T)
         if offset is not None:
             T = correct_heading(T, match.covariance, offset)
@@ -234,63 +225,52 @@ class ScanOdometry:
         return replace(match, T_map_base=T)
 
     def _match(
-        self,
-        beams: ScanBeams,
-        scan: Scan,
-        prior: MotionPrior,
-        learned: MotionPrior | None,
-        usual: float,
+        self, beams: ScanBeams, scan: Scan, prior: MotionPrior, learned: MotionPrior | None
     ) -> tuple[ScanMatch, bool]:
         """The match, and whether odometry slips."""
         self._is_adrift = False
-        if not self.local_map.has_sensor(beams.sensor) or not len(scan.points):
+        front_end, sensor, grid = self._front_end, beams.sensor, self.local_map.grid
+        if not self.local_map.has_sensor(sensor) or not len(scan.points):
             return accept_prior(learned or prior), False
-        grid = self.local_map.grid
         if self._reckoning.is_far and prior.is_odometry:
-            return self._find_again(scan, learned or prior, usual), False
-        match = match_scan(grid, scan, prior, usual, learned)
-        if not is_poor(match, usual):
-            self._weigh_evidence(Evidence.AGREES)
-            return match, match.contradicts_odometry
-        guess = self._guess() if prior.is_odometry else None
-        wider = widen_match(grid, scan, prior, guess, match, usual)
-        is_sure = not is_poor(wider, usual)  # a poor one is where a place only looks alike
-        step = se2.inverse(self._pose) @ wider.T_map_base
-        if wider.widened and is_sure and is_plausible(step, self._seconds_to(beams)):
-            return wider, prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
-        evidence = relocalization.judge_scan(grid, scan, match, usual)
-        if match.explained < _NOTHING * usual:
-            evidence = Evidence.CONTRADICTS
-        self._weigh_evidence(evidence)
-        return match, match.contradicts_odometry
+            return self._find_again(beams, scan, learned or prior), False
+        match, poor = front_end.match(grid, scan, sensor, prior, learned)
+        evidence = Evidence.AGREES
+        if poor:
+            guess = front_end.predict() if prior.is_odometry else None
+            match, evidence = front_end.search_wider(grid, scan, sensor, prior, guess, match)
+        front_end.weigh(beams.stamp_ns, match.T_map_base, self._seconds_to(beams), evidence)
+        is_outside = match.widened and is_inconsistent(prior, match.T_map_base)
+        return match, match.contradicts_odometry or (prior.is_odometry and is_outside)
 
-    def _find_again(self, scan: Scan, prior: MotionPrior, usual: float) -> ScanMatch:
+    def _find_again(self, beams: ScanBeams, scan: Scan, prior: MotionPrior) -> ScanMatch:
         """The match after a stretch in which no scan met anything."""
+        front_end, usual = self._front_end, self._front_end.usual.get(beams.sensor, 0.0)
         grid = self.local_map.grid
-        match, evidence = self._reckoning.search(grid, scan, prior, self._pose, usual)
+        match, evidence = self._reckoning.search(grid, scan, prior, front_end.pose, usual)
         if match is not None:
             # it was there before, too: the step is that of odometry
-            self._pose = match.T_map_base @ se2.inverse(prior.T_map_base) @ self._pose
-            self._contradictions = 0.0
+            front_end.pose = match.T_map_base @ se2.inverse(prior.T_map_base) @ front_end.pose
+            front_end.agree()
             return match
         self._is_adrift = not self._reckoning.is_over
         if not self._is_adrift:  # from here on scans are added to the map again
-            self._contradictions = 0.0
+            front_end.agree()
         if evidence is Evidence.CONTRADICTS:
-            self._weigh_evidence(evidence)
+            front_end.weigh(beams.stamp_ns, prior.T_map_base, self._seconds_to(beams), evidence)
         return accept_prior(prior)
 
     def _detect_fault(
         self, beams: ScanBeams, scan: Scan, prior: MotionPrior, match: ScanMatch
     ) -> Fault | None:
         """The fault of odometry, if any; scans since it began are removed from the local map."""
-        has_map = self.local_map.has_sensor(beams.sensor) and not self._contradictions
+        has_map = self.local_map.has_sensor(beams.sensor) and not self._is_contradicted
         fault = self._faults.detect(
             self.local_map.grid,
             scan,
-            self._pose,
+            self._front_end.pose,
             match,
-            self._usual.get(beams.sensor) if has_map else None,
+            self._front_end.usual.get(beams.sensor) if has_map else None,
             is_odometry=prior.is_odometry,
             may_stand=not (self.crowd.walks_along or self.crowd.may_walk_along),
         )
@@ -298,18 +278,10 @@ class ScanOdometry:
             self.local_map.remove_since(fault.first_ns)
         return fault
 
-    def _weigh_evidence(self, evidence: Evidence) -> None:
-        """Count scans that contradict the local map, less those that agree."""
-        if evidence is Evidence.CONTRADICTS:
-            self._contradictions = min(self._contradictions + 1.0, _MAX_STRAY)
-        else:
-            less = _AGREEMENT if evidence is Evidence.AGREES else _NO_EVIDENCE
-            self._contradictions = max(self._contradictions - less, 0.0)
-
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, LocalMap(self.options.resolution)
-        self._usual.clear()
-        self._contradictions, self._is_adrift = 0.0, False
+        self._front_end.start_anew()
+        self._is_adrift = False
         self._walls = WallDirections()
         self._faults.reset()
         self._reckoning.reset()
@@ -318,13 +290,12 @@ class ScanOdometry:
         """The odometry prior with the noise learned so far; None: use `prior`."""
         if not prior.is_odometry or increment is None:
             return None
-        return motion_model.odometry_prior(
-            self._pose, increment, self.options.odometry, self._odometry_noise
-        )
+        return self._front_end.follow_odometry(increment, learned=True)
 
-    def _guess(self) -> MotionPrior:
-        """Constant velocity from the last two poses."""
-        return motion_model.constant_velocity_prior(self._pose, self._before, self._velocity_noise)
+    @property
+    def _is_contradicted(self) -> bool:
+        """True while scans contradict the local map."""
+        return self._front_end.first_contradicting is not None
 
     def _seconds_to(self, beams: ScanBeams) -> float:
         """From the last scan."""
@@ -336,32 +307,15 @@ class ScanOdometry:
         seconds = self._seconds_to(beams)
         if self._is_first or seconds <= 0.0 or beams.beam_time is None:
             return np.zeros(3)
-        twist: Float = se2.log((se2.inverse(self._pose) @ T)[None])[0] / seconds
+        twist: Float = se2.log((se2.inverse(self._front_end.pose) @ T)[None])[0] / seconds
         is_leap = np.hypot(*twist[:2]) > MAX_SPEED or abs(twist[2]) > MAX_TURN_RATE
         return np.zeros(3) if is_leap else twist
-
-    def _learn(
-        self, beams: ScanBeams, learned: MotionPrior, match: ScanMatch, usual: float
-    ) -> None:
-        """Update the running averages of noise and of the explained share."""
-        if not self.local_map.has_sensor(beams.sensor):
-            return
-        if learned.is_odometry and not is_poor(match, usual):
-            self._odometry_noise = self._odometry_noise.update(
-                learned, match.T_map_base, match.covariance
-            )
-        rate = _EXPLAINED_RATE if usual > 0.0 else 1.0  # 0: the first scan of a map
-        self._usual[beams.sensor] = usual + rate * (match.explained - usual)
-        residual = self._guess().residual(match.T_map_base)
-        self._velocity_noise = self._velocity_noise.update(residual, self._seconds)
 
     def _advance(self, beams: ScanBeams, T: Float) -> None:
         if not self._is_first:
             seconds = self._seconds_to(beams)
             self._seconds = seconds if self._seconds == 0.0 else 0.9 * self._seconds + 0.1 * seconds
-            self.travelled += float(np.hypot(*(T[:2, 2] - self._pose[:2, 2])))
-            self._before = self._pose
-        else:
-            self._before = T
-        self._pose, self._stamp_ns, self._is_first = T, beams.stamp_ns, False
+        metres = self._front_end.advance(T, is_first=self._is_first)
+        self.travelled += 0.0 if self._is_first else metres
+        self._stamp_ns, self._is_first = beams.stamp_ns, False
         self._faults.advance(beams.stamp_ns)
