@@ -171,3 +171,20 @@ def test_iterations_feed_on_the_labels_of_the_last(short):
     moved = np.abs(second.estimate.p_static - first.estimate.p_static)[short.recording.hit] > 0.1
     assert second.record.changed_share == pytest.approx(moved.mean())
     assert dataclasses.is_dataclass(second)
+
+
+@pytest.mark.parametrize(("share", "is_refined"), [(0.1, True), (0.5, False)])
+def test_all_scans_are_matched_anew_where_many_labels_changed(room, monkeypatch, share, is_refined):
+    """From the third iteration on; before, they always are."""
+    real, initial = slam.m_step, []
+
+    def recorded(*args, **kwargs):
+        initial.append(kwargs["initial"])
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr("stillmap.pipeline.em_loop.slam.m_step", recorded)
+    monkeypatch.setattr("stillmap.pipeline.em_loop.em.touched_share", lambda *_: share)
+    iterations = stillmap.iterate(room.recording)
+    for _ in range(3):
+        next(iterations)
+    assert [one is not None for one in initial] == [False, False, is_refined]

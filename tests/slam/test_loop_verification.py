@@ -9,7 +9,7 @@ from driven import driven
 from stillmap import _core
 from stillmap.core import se2
 from stillmap.sim.walls import box
-from stillmap.slam import loop_candidates, loop_verification
+from stillmap.slam import loop_candidates
 from stillmap.slam.loop_verification import (
     Submap,
     _select_comparable,

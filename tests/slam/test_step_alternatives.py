@@ -5,7 +5,7 @@ import importlib
 
 import numpy as np
 import pytest
-from driven import ate, prior, silent
+from driven import ate, chained, prior, silent
 from rooms import drive
 from scipy.special import betaln
 
@@ -35,6 +35,12 @@ def test_log_evidence_is_that_of_beta_distributions():
             grid.log_evidence(a, b)
 
 
+def with_drift(recording):
+    """Odometry that leads astray, but not from one scan to the next."""
+    steps = se2.increments(recording.T_odom_base) @ se2.matrix(0.0, 0.0, np.radians(0.5))
+    return dataclasses.replace(recording, T_odom_base=chained(steps))
+
+
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.5 * np.pi), (0.0, 0.0, np.pi), (1.0, 0.0, 0.0)])
 def test_a_wrong_step_is_replaced(monkeypatch, offset):
     simulation, calls = room(), []
@@ -50,7 +56,7 @@ def test_a_wrong_step_is_replaced(monkeypatch, offset):
         return dataclasses.replace(matched, poses=poses, diagnostics=diagnostics)
 
     monkeypatch.setattr(M_STEP, "register_scans", err)
-    recording = simulation.recording
+    recording = with_drift(simulation.recording)
     options = slam.SlamOptions()
     found = slam.m_step(recording, prior(recording), options, None, 1, lambda *_: None)
     assert ate(found, simulation.truth) < 0.02
@@ -104,9 +110,26 @@ def test_odometry_that_jumps_at_every_scan():
     assert ate(estimated, simulation.truth) < 0.02
 
 
+def test_odometry_is_followed_where_scan_matching_is_led_astray(monkeypatch):
+    simulation = room()
+    truth = simulation.truth.T_world_base
+    recording = dataclasses.replace(simulation.recording, T_odom_base=truth)
+
+    def lead_astray(*args, **keywords):
+        matched = odometry_2d.register_scans(*args, **keywords)
+        steps = se2.increments(matched.poses) @ se2.matrix(0.0, 0.0, np.radians(0.5))
+        return dataclasses.replace(matched, poses=chained(steps))
+
+    monkeypatch.setattr(M_STEP, "register_scans", lead_astray)
+    for given, most in ((recording, 0.01), (recording.without_odometry(), np.inf)):
+        found = slam.m_step(given, prior(given), slam.SlamOptions(), None, 1, silent)
+        assert ate(found, simulation.truth) < most
+    assert ate(found, simulation.truth) > 0.05
+
+
 def test_an_iteration_keeps_poses_that_are_more_likely(monkeypatch):
     simulation = room()
-    recording, options = simulation.recording, slam.SlamOptions()
+    recording, options = with_drift(simulation.recording), slam.SlamOptions()
     e = prior(recording)
     first = slam.m_step(recording, e, options, None, 1, silent)
 

@@ -1,34 +1,30 @@
 """Warnings of a run: what limits the trust in its result, where, and what to do about it."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from stillmap.core.array_types import Float
 from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
-from stillmap.pipeline.em_loop import Estimate, IterationRecord
+from stillmap.pipeline.em_loop import Estimate
 from stillmap.pipeline.final_map import Maps
 from stillmap.pipeline.snapshots import extent
 
 _LOST = 0.2  # explained share of a scan's beams below which its pose cannot be trusted
 
 
-def find_warnings(
-    best: Estimate, recording: Recording, records: Sequence[IterationRecord] = ()
-) -> list[str]:
+def find_warnings(best: Estimate, recording: Recording) -> list[str]:
     """One sentence per warning, those of the reader first; see `core.errors`.
 
     Args:
         best: the estimate that is kept.
         recording: as mapped.
-        records: of all iterations.
     """
     return [
         *recording.source.warnings,
         *_input_warnings(best, recording),
-        *_source_warnings(records, best.number),
         *_length_warnings(best),
         *_scan_warnings(best, recording),
     ]
@@ -61,23 +57,6 @@ def _input_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
     explained = best.m_step.explained  # NaN: poses were given
     if recording.T_odom_base is None and not (len(explained) and np.isnan(explained).all()):
         yield "no odometry: the robot was assumed to keep its velocity from one scan to the next"
-
-
-_SOURCES = {
-    "odometry": "odometry alone",
-    "odometry_in_stretches": "odometry in stretches that scan matching measured otherwise",
-}
-
-
-def _source_warnings(records: Sequence[IterationRecord], best: int) -> Iterator[str]:
-    """That odometry or scans alone explain the recording better than iterations did."""
-    for record in records:
-        if record.source:
-            kept = "were kept" if record.number == best else "were the start of further iterations"
-            yield (
-                f"poses by {_SOURCES[record.source]} predict scans left out of the map better than "
-                f"those of iterations 1 to {record.number - 1}: they {kept}"
-            )
 
 
 def _length_warnings(best: Estimate) -> Iterator[str]:

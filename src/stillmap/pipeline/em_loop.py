@@ -84,8 +84,6 @@ class IterationRecord:
         seconds: wall clock.
         held_out_log_likelihood: nats per beam of scans left out of the map; None: not computed.
         touched_share: share of the scans that the next M-step may match differently.
-        source: "odometry" if the poses are those of odometry, "odometry_in_stretches" if labels
-            were estimated with it in stretches; else empty.
     """
 
     number: int
@@ -95,7 +93,6 @@ class IterationRecord:
     seconds: float
     held_out_log_likelihood: float | None = None
     touched_share: float = 1.0
-    source: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +152,7 @@ class EmState(ShortRepr):
             gain = self._score(record, n_beams) - self._score(
                 self.records[self.best.number - 1], n_beams
             )
-        # a source was compared with the best iteration before it became an iteration
-        if gain > 0.0 or fixed or record.source:
+        if gain > 0.0 or fixed:
             self.best = estimate.without_grid()
         self._take_snapshot(iteration)
         self.latest = estimate.for_next_iteration()
@@ -340,7 +336,6 @@ def _m_step(
         resolve_threads(options.threads),
         lambda stage, done, total: progress(stage, number, done, total),
         initial=before.m_step if before and _needs_refinement_only(recording, before) else None,
-        earlier_poses=None if before is None else before.poses,
         earlier=None if before is None else before.m_step,
         with_grid=em.needs_counts(options.estimator),
         # (10) as printed counts beams up to their end

@@ -22,7 +22,6 @@ from stillmap.pipeline.em_loop import EmState, Estimate, IterationRecord, iterat
 from stillmap.pipeline.final_map import FinalEstimate, Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.map_frame import enter_local_frame, leave_local_frame, move_odometry
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
-from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.slam.mount_calibration import Calibration
@@ -179,12 +178,6 @@ def map_recording(
         recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
     )
     _run_em(recording, state, poses, progress, stages, checkpoint)
-    if poses is None and not any(record.source for record in state.records):
-        source = better_source(recording, state, progress, stages)
-        if source is not None:
-            state.update(source)
-            state.converged = False
-            _run_em(recording, state, None, progress, stages, checkpoint)
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
     recording = move_odometry(recording, odometry)
@@ -247,7 +240,7 @@ def _finish(
         maps=maps,
         converged=state.converged,
         warnings=[
-            *find_warnings(estimate, recording, state.records),
+            *find_warnings(estimate, recording),
             *find_map_warnings(maps, recording, estimate.poses),
         ],
         objects=objects,

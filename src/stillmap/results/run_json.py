@@ -15,7 +15,6 @@ from stillmap.core.json import to_jsonable
 from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
-from stillmap.pipeline.em_loop import IterationRecord
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.objects import MILLIMETRES
@@ -46,7 +45,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "version": package_version(),
         "input": result.recording.source.to_dict(),
         "options": to_dict(result.options),
-        "iterations": [_iteration(it) for it in result.iterations],
+        "iterations": [dataclasses.asdict(it) for it in result.iterations],
         "converged": result.converged,
         "best_iteration": result.best_iteration,
         **{
@@ -227,10 +226,3 @@ def _door(door: Door) -> dict[str, Any]:
         "open": round(door.opened, MILLIMETRES),
         "states": [one._asdict() for one in door.states],
     }
-
-
-def _iteration(it: IterationRecord) -> dict[str, Any]:
-    record = dataclasses.asdict(it)
-    if not it.source:
-        del record["source"]
-    return record

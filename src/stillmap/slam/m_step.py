@@ -116,7 +116,6 @@ def m_step(
     progress: StepProgress,
     *,
     initial: MStepResult | None = None,
-    earlier_poses: Float | None = None,
     earlier: MStepResult | None = None,
     with_grid: bool = True,
     free_space_margin: float = FREE_SPACE_MARGIN,
@@ -131,9 +130,8 @@ def m_step(
         threads: of the 3D registration and of the map; the result does not depend on it.
         progress: called with the step, the number of scans done and their total.
         initial: an M-step with closed loops: its poses are only refined. 2D only.
-        earlier_poses: (T, 3, 3) estimate that is better than odometry for deskewing. 2D only.
-        earlier: an earlier M-step: it is refined, and kept if scans matched anew are less likely.
-            2D only.
+        earlier: an earlier M-step, better than odometry for deskewing: it is refined, and kept if
+            scans matched anew are less likely. 2D only.
         with_grid: whether to compute the sums of (10).
         free_space_margin: m before its end in which a beam is not used as free space; (10) as
             printed has 0.
@@ -146,9 +144,7 @@ def m_step(
     else:
         matched, weights = thin_scans(recording, e) if D == 2 else (recording, e)
         step = _PoseStep(matched, weights, options, threads, progress, free_space_margin)
-        estimated = (
-            step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses, earlier)
-        )
+        estimated = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier)
         progress("counting beams", 0, 0)
     if with_grid:
         deskewed = deskew_recording(recording, estimated.poses, options, threads)
@@ -181,17 +177,12 @@ class _PoseStep:
         poses, loops, graph = close_loops_3d(recording, e, options, odometry, closing, threads)
         return dataclasses.replace(estimated, poses=poses, loops=loops, graph=graph)
 
-    def estimate_2d(
-        self,
-        initial: MStepResult | None,
-        earlier_poses: Float | None,
-        earlier: MStepResult | None,
-    ) -> MStepResult:
+    def estimate_2d(self, initial: MStepResult | None, earlier: MStepResult | None) -> MStepResult:
         """Scan matching, loop closure and refinement."""
         if initial is not None and self.options.loop_closure:
             return self._refine(initial, self._progress("matching scans"))
         recording, options = self.recording, self.options
-        motion = recording.T_odom_base if earlier_poses is None else earlier_poses
+        motion = recording.T_odom_base if earlier is None else earlier.poses
         if motion is None and options.deskew and recording.beam_time is not None:
             motion = self._match_scans(recording).poses  # skewed scans are good enough
         deskewed = self._deskew(motion)

@@ -19,7 +19,7 @@ from stillmap.core.recording import Recording
 from stillmap.slam import local_map, scan_hits
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.trajectory_cost import OdometryCost, map_evidence
-from stillmap.slam.types import MStepResult
+from stillmap.slam.types import Diagnostics, MStepResult
 
 # m of travel and scans on both sides, at least: that are matched again, and that are compared, as
 # far as the local map reaches
@@ -131,6 +131,10 @@ def revise_steps(
     best = _Choice(matched, closed, comparison.cost(closed))
     if earlier is not None and comparison.cost(earlier) < best.cost:
         return earlier
+    odometry = comparison.follow_odometry(matched)
+    if odometry is not None and comparison.cost(odometry) < best.cost:
+        closed = methods.close_loops(odometry)
+        best = _Choice(odometry, closed, comparison.cost(closed))
     changed = np.ones(recording.n_scans, np.bool_)
     while alternatives := comparison.propose(best.matched, changed):
         before, best = best.matched, comparison.choose(best, alternatives)
@@ -155,6 +159,14 @@ class _Comparison:
             matched.poses, recording.sensor, local_map.SCAN_SPACING, local_map.SCAN_SPACING
         )
         self.odometry_cost = OdometryCost(recording, matched.poses, options.odometry)
+
+    def follow_odometry(self, matched: MStepResult) -> MStepResult | None:
+        """The trajectory of odometry alone; None: there is none."""
+        T = self.recording.T_odom_base
+        if T is None:
+            return None
+        poses = se2.normalize(se2.inverse(T[0]) @ T)
+        return dataclasses.replace(matched, poses=poses, loops=[], diagnostics=Diagnostics())
 
     def choose(self, best: _Choice, alternatives: list[_Alternative]) -> _Choice:
         """The more likely of a trajectory and the same with alternatives: all of them, or parts."""
