@@ -105,12 +105,14 @@ class _ScanOdometry:
         match, poor, evidence = accept_prior(prior), False, Evidence.AGREES
         if has_map:
             match, poor = front_end.match(grid, scan, s, prior, learned)
-        if poor and self.search_wider:
+        is_off = poor or is_inconsistent(learned or prior, match.T_map_base)
+        if is_off and self.search_wider:
             # one scan that fits somewhere near does not say where the robot went, or was carried,
             # while nothing was recorded: all that follow decide
             if is_gap(seconds, self.seconds, (learned or prior).translation_std):
                 self._start_segment(t, learned or prior)
                 return
+        if poor and self.search_wider:
             match, evidence = front_end.search_wider(grid, scan, s, prior, alternative, match)
         front_end.weigh(t, match.T_map_base, seconds, evidence)
         self._record(t, match, is_fault=self._rejects_odometry(t, prior, alternative, match))
