@@ -245,7 +245,7 @@ class ScanOdometry:
 
     def _find_again(self, beams: ScanBeams, scan: Scan, prior: MotionPrior) -> ScanMatch:
         """The match after a stretch in which no scan met anything."""
-        front_end, usual = self._front_end, self._front_end.usual.get(beams.sensor, 0.0)
+        front_end, usual = self._front_end, self._front_end.usual.get(beams.sensor, 1.0)
         grid = self.local_map.grid
         match, evidence = self._reckoning.search(grid, scan, prior, front_end.pose, usual)
         if match is not None:
@@ -280,7 +280,7 @@ class ScanOdometry:
 
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, LocalMap(self.options.resolution)
-        self._front_end.start_anew()
+        self._front_end.agree()
         self._is_adrift = False
         self._walls = WallDirections()
         self._faults.reset()

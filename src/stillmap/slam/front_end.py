@@ -65,12 +65,8 @@ class FrontEnd:
     def __init__(self, options: OdometryOptions) -> None:
         self._options = options
         self.pose, self.before = np.eye(3), np.eye(3)
-        self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
-        self.start_anew()
-
-    def start_anew(self) -> None:
-        """Begin a new local map, in which nothing is known of the scans."""
         self.usual: dict[str | int, float] = {}
+        self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self.agree()
 
     def agree(self) -> None:
@@ -101,7 +97,7 @@ class FrontEnd:
         learned: MotionPrior | None,
     ) -> tuple[ScanMatch, bool]:
         """The match of a scan within its prior, and whether it is a poor one."""
-        usual = self.usual.get(sensor, 0.0)
+        usual = self.usual.get(sensor, 1.0)
         match = match_scan(grid, scan, prior, usual, learned)
         return match, len(scan.points) > 0 and is_poor(match, usual)
 
@@ -115,7 +111,7 @@ class FrontEnd:
         match: ScanMatch,
     ) -> tuple[ScanMatch, Evidence]:
         """A poor match, or one outside the prior that is more likely, and what it says."""
-        usual = self.usual.get(sensor, 0.0)
+        usual = self.usual.get(sensor, 1.0)
         wider = widen_match(grid, scan, prior, alternative, match, usual)
         if wider.widened:
             return wider, Evidence.AGREES
@@ -157,13 +153,12 @@ class FrontEnd:
             match: of the scan.
             seconds: usually between scans.
         """
-        usual = self.usual.get(sensor, 0.0)
+        usual = self.usual.get(sensor, 1.0)
         if prior.is_odometry and not is_poor(match, usual):
             self._odometry_noise = self._odometry_noise.update(
                 prior, match.T_map_base, match.covariance
             )
-        rate = _EXPLAINED_RATE if usual > 0.0 else 1.0  # 0: the first scan of a map
-        self.usual[sensor] = usual + rate * (match.explained - usual)
+        self.usual[sensor] = usual + _EXPLAINED_RATE * (match.explained - usual)
         residual = self.predict().residual(match.T_map_base)
         self._velocity_noise = self._velocity_noise.update(residual, seconds)
 

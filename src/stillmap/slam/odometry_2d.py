@@ -158,7 +158,7 @@ class _ScanOdometry:
         match = accept_prior(prior)
         self.breaks.append(t)
         self.local_map.clear()
-        self.front_end.start_anew()
+        self.front_end.agree()
         self._record(t, match, is_fault=False)
         self._note_drift(t, prior, match, float(self.seconds_before[t]))
         self.travelled += self.front_end.advance(match.T_map_base, is_first=True)
