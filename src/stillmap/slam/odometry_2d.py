@@ -106,12 +106,12 @@ class _ScanOdometry:
         if has_map:
             match, poor = front_end.match(grid, scan, s, prior, learned)
         is_off = poor or is_inconsistent(learned or prior, match.T_map_base)
-        if is_off and self.search_wider:
+        after_gap = is_gap(seconds, self.seconds, (learned or prior).translation_std)
+        if is_off and after_gap and self.search_wider:
             # one scan that fits somewhere near does not say where the robot went, or was carried,
             # while nothing was recorded: all that follow decide
-            if is_gap(seconds, self.seconds, (learned or prior).translation_std):
-                self._start_segment(t, learned or prior)
-                return
+            self._start_segment(t, learned or prior)
+            return
         if poor and self.search_wider:
             match, evidence = front_end.search_wider(grid, scan, s, prior, alternative, match)
         front_end.weigh(t, match.T_map_base, seconds, evidence)
