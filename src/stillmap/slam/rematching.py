@@ -5,28 +5,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-import stillmap._core as _core
 from stillmap.core import se2, se3
-from stillmap.core.array_types import Float, Float32, Index
+from stillmap.core.array_types import Float, Index
 from stillmap.core.recording import Recording
 from stillmap.prepare.options import MAX_POINT_DISTANCE
 from stillmap.slam.lidar_odometry import register_sweeps
-from stillmap.slam.local_map import LocalMap
-from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior
+from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import (
-    FREE_SPACE_MARGIN,
     beams_of_scans,
     sees_all_round,
     select_beams,
-    select_hits,
 )
-from stillmap.slam.scan_matching import refine_pose, search_pose
 
 _RESOLUTION = 0.1  # m, of the map that scans are matched against, whatever that of the result
-_EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-_POOR_SHARE = 0.8  # of the usual explained share, below which other poses are searched
-_SEARCH_TRANSLATION, _SEARCH_ROTATION = 1.0, 0.3  # m and rad around the given motion
 _P_STATIC = 0.9  # of every return: labels are not asked
 _WINDOW = {2: 360, 3: 48}  # scans of a window, by dimension
 _MAX_SPACING, _MAX_STEP = 0.5, 0.5  # s and m between the scans of a window
@@ -130,31 +122,8 @@ def _rematch(window: Recording, poses: Float, threads: int) -> Float:
     e = np.full(window.n_beams, _P_STATIC, np.float32)
     options = SlamOptions(resolution=_RESOLUTION)
     if window.dimension == 2:
-        found = _match_scans(window, e, options)
+        # a wider search would mend poses given that jump, and agree with none of their neighbours
+        found = register_scans(window, e, options, lambda *_: None, search_wider=False).poses
         return se2.normalize(poses[0] @ se2.inverse(found[0]) @ found)
     sweeps = register_sweeps(window, e, options.odometry, lambda *_: None, threads, _MAX_POINTS)
     return se3.normalize(poses[0] @ se2.inverse(sweeps.poses[0]) @ sweeps.poses)
-
-
-def _match_scans(window: Recording, e: Float32, options: SlamOptions) -> Float:
-    """Poses (n, 3, 3) of 2D scans, each matched within the prior of odometry.
-
-    Without the wide searches of `register_scans`: given poses that jump disagree with these anyway.
-    """
-    assert window.T_odom_base is not None
-    increments = compute_odometry_steps(window.T_odom_base, window.stamp_ns).increments
-    grid = _core.OccupancyGrid2D(options.resolution, FREE_SPACE_MARGIN)
-    local_map = LocalMap(grid, window, e)
-    found = np.tile(np.eye(3), (window.n_scans, 1, 1))
-    local_map.add(0, found[0], 0.0)
-    usual = 1.0
-    for t in range(1, window.n_scans):
-        prior = odometry_prior(found[t - 1], increments[t - 1], options.odometry)
-        scan = select_hits(window, e, t)
-        match = refine_pose(grid, scan, prior, prior.T_map_base)
-        if match.explained < _POOR_SHARE * usual:
-            match = search_pose(grid, scan, prior, _SEARCH_TRANSLATION, _SEARCH_ROTATION)
-        usual += _EXPLAINED_RATE * (match.explained - usual)
-        found[t] = match.T_map_base
-        local_map.add(t, found[t], 0.0)
-    return found
