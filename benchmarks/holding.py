@@ -59,10 +59,6 @@ ABLATION = (
     ),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),
     Variant(
-        "not compared with odometry alone",
-        constants={"stillmap.pipeline.pose_sources._MAX_SHORTFALL": -math.inf},
-    ),
-    Variant(
         "movers that stay long are not rare",
         constants={"stillmap.em.occupancy_hmm._LONG_TAU": math.inf},
     ),
