@@ -156,35 +156,24 @@ void bind_occluded_share(nb::module_& m) {
 // Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
 QuadraticModel data_term(const OccupancyGrid<2>& grid, const Points<2>& points,
                          const Flat<float>& weights, const OnePose<2>& T,
-                         const LikelihoodFieldOptions& field_options,
-                         const std::optional<Points<2>>& normals,
-                         const std::optional<Flat<float>>& isotropy) {
+                         const LikelihoodFieldOptions& field_options) {
   auto beams = beams_from(points, weights);
-  const Pose<2> pose = checked_pose<2>(T, "T");
   LikelihoodField field(grid, field_options);
-  if (normals) {
-    add_normals(beams, points, weights, *normals, isotropy);
-    mark_beyond_map(field, beams, pose);
-  }
-  auto q = linearise(field, beams, pose, {field_options, 1.0, 0});
+  auto q = linearise(field, beams, checked_pose<2>(T, "T"), {field_options, 1.0, 0});
   for (const double w : beams.weights) q.cost -= w * std::log(field_options.floor + 1.0);
   return q;
 }
 
 double cost_at(const OccupancyGrid<2>& grid, const Points<2>& points, const Flat<float>& weights,
-               const OnePose<2>& T, double sigma, int radius, double floor, double unknown,
-               const std::optional<Points<2>>& normals,
-               const std::optional<Flat<float>>& isotropy) {
+               const OnePose<2>& T, double sigma, int radius, double floor, double unknown) {
   const LikelihoodFieldOptions options{sigma, radius, floor, unknown};
-  return data_term(grid, points, weights, T, options, normals, isotropy).cost;
+  return data_term(grid, points, weights, T, options).cost;
 }
 
 auto gradient_at(const OccupancyGrid<2>& grid, const Points<2>& points, const Flat<float>& weights,
-                 const OnePose<2>& T, double sigma, int radius, double floor, double unknown,
-                 const std::optional<Points<2>>& normals,
-                 const std::optional<Flat<float>>& isotropy) {
+                 const OnePose<2>& T, double sigma, int radius, double floor, double unknown) {
   const LikelihoodFieldOptions options{sigma, radius, floor, unknown};
-  const auto q = data_term(grid, points, weights, T, options, normals, isotropy);
+  const auto q = data_term(grid, points, weights, T, options);
   const size_t n = 3;
   return to_numpy(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
 }
@@ -211,14 +200,11 @@ void bind_registration(nb::module_& m) {
   m.def("registration_cost", &cost_at, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
-        nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
         "Cost -sum w ln(floor + unknown U + F) at one pose, with the likelihood field F and U = 1 "
-        "in unobserved cells. With normals (N, 2) and isotropy (N,), F of an end point "
-        "where the mapped part of a flat surface ends depends on the distance from it only.");
+        "in unobserved cells.");
   m.def("registration_gradient", &gradient_at, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
-        nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
         "Gradient (dof,) of `registration_cost` with respect to translation and rotation about the "
         "sensor.");
 }

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import reference
 from reference.likelihood_field import retract
-from surfel_maps import together
 
 from stillmap import _core
-from stillmap.core import se2
 
 FLOOR, UNKNOWN = 0.02, 0.3
 
@@ -60,37 +58,6 @@ def test_gradient(beams, grids):
         assert core.shape == delta.shape
         assert np.abs(plain).max() > 1
         assert core == pytest.approx(plain, rel=1e-4, abs=1e-3 * np.abs(plain).max())
-
-
-def test_surface_that_goes_on_beyond_the_map():
-    """A wall of which the map knows a part, and a scan that sees more of it, a little off."""
-    rng = np.random.default_rng(0)
-    wall = np.stack([np.arange(-3.5, 0.5, 0.03), np.full(134, 1.5)], axis=-1)
-    wall += rng.normal(scale=0.01, size=wall.shape)
-    grids = []
-    for kernels in (_core, reference):
-        grid = kernels.OccupancyGrid2D(0.05)
-        known, hit, offset, T = together(wall[wall[:, 0] < -1.1])
-        kernels.add_beams(grid, known, hit, np.ones(len(known), np.float32), offset, T)
-        grids.append(grid)
-    points, weights = wall.astype(np.float32), np.ones(len(wall), np.float32)
-    normals, isotropy = _core.estimate_normals(
-        points, radius=0.3, max_gap=1.0, flat_below=0.1, round_from=0.4
-    )
-    pose = se2.matrix(0.01, 0.02, 0.005)
-    ends = reference.ends_of_surfaces(grids[1], points, normals, isotropy, pose, 2)
-    assert 3 <= np.count_nonzero(ends.any(axis=1)) < 70
-    ahead = points * np.float32([-1.0, 1.0])
-    assert not reference.ends_of_surfaces(grids[1], ahead, normals, isotropy, pose, 2).any()
-    options = 0.04, 2, 0.05, 0.2
-    plain = reference.registration_cost(grids[1], points, weights, pose, *options, ends)
-    core = _core.registration_cost(grids[0], points, weights, pose, *options, normals, isotropy)
-    assert core == pytest.approx(plain, rel=1e-6)
-    without = _core.registration_cost(grids[0], points, weights, pose, *options)
-    assert abs(core - without) > 0.1
-    plain = reference.registration_gradient(grids[1], points, weights, pose, *options, ends)
-    core = _core.registration_gradient(grids[0], points, weights, pose, *options, normals, isotropy)
-    np.testing.assert_allclose(core, plain, rtol=1e-4, atol=1e-3 * np.abs(plain).max())
 
 
 def curvature_of(grid, points, weights, T, sigma, radius):

@@ -61,47 +61,7 @@ def _line(means, m):
     return mean, axes[:, 0], bool(variance[0] < 0.1 * variance[1])
 
 
-def ends_of_surfaces(grid, points, normals, isotropy, T, radius):
-    """(N, 2) normals in the map of the flat surfaces whose mapped part ends at a point; else 0.
-
-    0 too where the scan looks ahead: the mean cosine of the bearings, which weigh the same here, is
-    -0.2 or more.
-
-    It ends where no mean within `radius` cells lies half a cell or more to one side along the
-    surface, and the cell radius + 1 cells to that side is unobserved.
-    """
-    pose, out = np.asarray(T, float), np.zeros((len(np.asarray(points)), 2))
-    bearings = np.asarray(points, float)[:, 0] / np.linalg.norm(points, axis=1)
-    if bearings.mean() >= -0.2:
-        return out
-    surfaces = zip(*(np.asarray(x, float) for x in (points, normals, isotropy)), strict=True)
-    for k, (p, n, s) in enumerate(surfaces):
-        if s > 0.5 or not n.any() or not np.isfinite(p).all():
-            continue
-        y, normal = pose[:2, :2] @ p + pose[:2, 2], pose[:2, :2] @ n
-        means, _ = _around(grid, cell_of(y, grid.resolution), radius)
-        for tangent in ([-normal[1], normal[0]], [normal[1], -normal[0]]):
-            there = y + np.array(tangent) * (radius + 1) * grid.resolution
-            known = (means - y) @ tangent >= 0.5 * grid.resolution
-            unseen = isnan(grid.occupancy_of(tuple(cell_of(there, grid.resolution).tolist())))
-            if unseen and not known.any():
-                out[k] = normal
-    return out
-
-
-def _field_at_end(grid, y, normal, sigma, radius):
-    """F where the mapped part of a surface ends: the mean of the m_k times exp(-d^2 / 2 sigma^2).
-
-    d is the distance along the normal from the mean of the mu_k.
-    """
-    means, m = _around(grid, cell_of(y, grid.resolution), radius)
-    if not len(m):
-        return 0.0
-    distance = normal @ (m @ means / m.sum() - y)
-    return float(m.mean() * exp(-(distance**2) / (2 * sigma**2)))
-
-
-def registration_cost(grid, points, weights, T, sigma, radius, floor, unknown, ends=None):
+def registration_cost(grid, points, weights, T, sigma, radius, floor, unknown):
     """- sum of w_n ln(floor + unknown U(T p_n) + F(T p_n)) over the points that are finite.
 
     U is 1 in unobserved cells, 0 elsewhere.
@@ -115,18 +75,14 @@ def registration_cost(grid, points, weights, T, sigma, radius, floor, unknown, e
         radius: cells.
         floor: value of an end point in free space, where a wall has 1.
         unknown: added to floor in unobserved cells.
-        ends: (N, 2) of `ends_of_surfaces`; None: no surface ends.
     """
     pose = np.asarray(T, float)
     cost = 0.0
     beams = zip(np.asarray(points, float), np.asarray(weights, float), strict=True)
-    for k, (p, w) in enumerate(beams):
+    for p, w in beams:
         if np.isfinite(p).all():
             y = pose[:2, :2] @ p + pose[:2, 2]
-            if ends is not None and ends[k].any():
-                F = _field_at_end(grid, y, ends[k], sigma, radius)
-            else:
-                F = smoothed_occupancy(grid, y, sigma, radius)
+            F = smoothed_occupancy(grid, y, sigma, radius)
             cost -= w * log(_base(grid, y, floor, unknown) + F)
     return float(cost)
 
@@ -136,9 +92,7 @@ def _base(grid, y, floor, unknown):
     return floor + (unknown if unseen else 0.0)
 
 
-def registration_gradient(
-    grid, points, weights, T, sigma, radius, floor, unknown, ends=None, step=1e-06
-):
+def registration_gradient(grid, points, weights, T, sigma, radius, floor, unknown, step=1e-06):
     """Gradient of `registration_cost` by central differences.
 
     Returns:
@@ -150,7 +104,7 @@ def registration_gradient(
     for delta in step * np.eye(3):
         above, below = (
             registration_cost(
-                grid, points, weights, retract(pose, d), sigma, radius, floor, unknown, ends
+                grid, points, weights, retract(pose, d), sigma, radius, floor, unknown
             )
             for d in (delta, -delta)
         )

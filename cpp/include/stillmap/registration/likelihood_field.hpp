@@ -98,38 +98,6 @@ class LikelihoodField {
     return sample;
   }
 
-  // Whether the mapped part of a surface ends at a point: in the direction of a unit tangent there
-  // are no occupied cells, and the cell beyond the radius is unobserved.
-  bool is_end_of_mapped_surface(const Vec<2>& point, const Vec<2>& tangent,
-                                GaussianWindow& window) {
-    const Vec<2> y = point / resolution_;
-    if (!gather_around(y, window)) return false;
-    constexpr double kReach = 0.5;  // cells
-    for (const auto& gaussian : window.gaussians)
-      if (tangent.dot(gaussian.mean - y) >= kReach) return false;
-    return !cursor_.find_observed(cell_of<2>(y + tangent * (options_.radius + 1.0)));
-  }
-
-  // The field at the end of the mapped part of a flat surface (unit normal): it depends on the
-  // distance from the surface only, not on the position along it.
-  FieldSample evaluate_beyond_map(const Vec<2>& point, const Vec<2>& normal,
-                                  GaussianWindow& window) {
-    FieldSample sample;
-    sample.baseline = options_.floor;
-    const Vec<2> y = point / resolution_;
-    if (!gather_around(y, window)) return sample;
-    sample.baseline = window.baseline;
-    double total = 0.0;
-    Vec<2> mean = Vec<2>::Zero();
-    for (const auto& gaussian : window.gaussians) {
-      total += gaussian.weight;
-      mean += gaussian.weight * gaussian.mean;
-    }
-    if (!(total > 0.0)) return sample;
-    const double occupancy = total / static_cast<double>(window.gaussians.size());
-    return on_plane(y, normal, mean / total, occupancy, sample.baseline);
-  }
-
  private:
   // Fills the window of a point in cells; false where the point is out of range.
   bool gather_around(const Vec<2>& y, GaussianWindow& window) {
@@ -141,19 +109,14 @@ class LikelihoodField {
   // Extends a surface into unobserved space: the end of the mapped part must not pull scans along
   // it.
   FieldSample extrapolate(const Vec<2>& y, const GaussianWindow& window) const {
-    return on_plane(y, window.normal, window.plane_point, window.mean_occupancy, window.baseline);
-  }
-
-  FieldSample on_plane(const Vec<2>& y, const Vec<2>& normal, const Vec<2>& plane_point,
-                       double occupancy, double baseline) const {
     FieldSample sample;
-    sample.baseline = baseline;
-    const double distance = normal.dot(plane_point - y);
+    sample.baseline = window.baseline;
+    const double distance = window.normal.dot(window.plane_point - y);
     const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
-    sample.value = occupancy * std::exp(exponent_ * distance * distance);
-    sample.log_gradient = normal * (distance * resolution_ * per_metre2);
+    sample.value = window.mean_occupancy * std::exp(exponent_ * distance * distance);
+    sample.log_gradient = window.normal * (distance * resolution_ * per_metre2);
     sample.pull_covariance.setIdentity();
-    sample.pull_covariance -= normal * normal.transpose();
+    sample.pull_covariance -= window.normal * window.normal.transpose();
     sample.pull_covariance *= per_metre2;
     return sample;
   }

@@ -23,7 +23,6 @@ struct WeightedBeams {
   std::vector<double> weights;
   std::vector<SurfaceNormal> normals;   // moving frame; empty: unknown
   std::vector<GaussianWindow> windows;  // cache, one per beam
-  std::vector<bool> beyond_map;         // see mark_beyond_map; empty: none is
   // share of each beam that the map explains at a pose; of the last one that was evaluated
   std::vector<double> explained;
   std::optional<Pose<2>> explained_at;
@@ -90,10 +89,7 @@ inline QuadraticModel linearise(LikelihoodField& field, WeightedBeams& beams, co
     const double weight = options.information_scale * beams.weights[n];
     const Vec<2> lever = pose.R * beams.points[n];
     const Vec<2> point = pose.t + lever;
-    const FieldSample sample =
-        !beams.beyond_map.empty() && beams.beyond_map[n]
-            ? field.evaluate_beyond_map(point, pose.R * beams.normals[n].normal, beams.windows[n])
-            : field.evaluate(point, beams.windows[n]);
+    const FieldSample sample = field.evaluate(point, beams.windows[n]);
     total += beams.weights[n];
     model.cost -= weight * std::log((sample.baseline + sample.value) / (options.field.floor + 1.0));
     if (sample.value <= 0.0) continue;
@@ -106,7 +102,7 @@ inline QuadraticModel linearise(LikelihoodField& field, WeightedBeams& beams, co
         weight * p_explained * (J.transpose() * curvature(sample, options.field.sigma) * J);
   }
   if (total > 0.0) model.inliers /= total;
-  if (beams.beyond_map.empty()) beams.explained_at = pose;
+  beams.explained_at = pose;
   return model;
 }
 
@@ -128,49 +124,12 @@ inline Eigen::Matrix3d surface_information(LikelihoodField& field, WeightedBeams
   return information;
 }
 
-// Mean cosine of the bearings of the end points, weighted; 1 straight ahead.
-inline double mean_bearing_cosine(const WeightedBeams& beams) {
-  double total = 0.0, sum = 0.0;
-  for (size_t n = 0; n < beams.points.size(); ++n) {
-    const double range = beams.points[n].norm();
-    if (!(range > 0.0)) continue;
-    total += beams.weights[n];
-    sum += beams.weights[n] * beams.points[n][0] / range;
-  }
-  return total > 0.0 ? sum / total : 0.0;
-}
-
-// Marks the end points at `pose` that lie at the end of the mapped part of a flat surface, of
-// scans that look backwards: ahead of the robot, walls that end at unknown space fix its position
-// along them.
-inline void mark_beyond_map(LikelihoodField& field, WeightedBeams& beams, const Pose<2>& pose) {
-  constexpr double kFlat = 0.5;       // isotropy, up to which a surface has a direction
-  constexpr double kBackward = -0.2;  // mean cosine of the bearings of a backward scan, at most
-  beams.beyond_map.clear();
-  if (mean_bearing_cosine(beams) >= kBackward) return;
-  beams.windows.resize(beams.points.size());
-  beams.beyond_map.assign(beams.points.size(), false);
-  for (size_t n = 0; n < beams.normals.size(); ++n) {
-    const auto& surface = beams.normals[n];
-    if (surface.isotropy > kFlat || surface.normal.isZero(0.0)) continue;
-    const Vec<2> point = pose * beams.points[n], normal = pose.R * surface.normal;
-    const Vec<2> tangent(-normal[1], normal[0]);
-    beams.beyond_map[n] = field.is_end_of_mapped_surface(point, tangent, beams.windows[n]) ||
-                          field.is_end_of_mapped_surface(point, -tangent, beams.windows[n]);
-  }
-}
-
-// Levenberg-Marquardt from `start`. Of backward scans, end points at the end of the mapped part of
-// a surface (found at `start`) do not constrain the position along it: the newly seen piece of a
-// wall would be pulled to the end of the mapped one, and the robot with it. Cost, inliers and
-// information of the result are those of the unmodified field, so that results from several starts
-// compare.
+// Levenberg-Marquardt from `start`.
 inline ScanRegistrationResult minimise_levenberg_marquardt(LikelihoodField& field,
                                                            WeightedBeams& beams,
                                                            const PosePrior& prior,
                                                            const Pose<2>& start,
                                                            const ScanRegistrationOptions& options) {
-  mark_beyond_map(field, beams, start);
   auto with_prior = [&](const Pose<2>& pose, double cost) {
     const Lie<2>::Tangent difference = pose.boxminus(prior.pose);
     return cost + 0.5 * difference.dot(prior.information * difference);
@@ -200,11 +159,6 @@ inline ScanRegistrationResult minimise_levenberg_marquardt(LikelihoodField& fiel
       damping = std::max(damping, 1e-3) * 10.0;
     }
     if (converged || damping > 1e6) break;
-  }
-  if (!beams.beyond_map.empty()) {
-    beams.beyond_map.clear();
-    model = linearise(field, beams, result.pose, options);
-    result.cost = with_prior(result.pose, model.cost);
   }
   result.information = model.hessian + prior.information;
   result.inliers = model.inliers;
