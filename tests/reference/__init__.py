@@ -23,7 +23,6 @@ from reference.held_out_likelihood import (
     score_held_out,
 )
 from reference.likelihood_field import (
-    ends_of_surfaces,
     registration_cost,
     registration_curvature,
     registration_gradient,
