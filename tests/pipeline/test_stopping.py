@@ -187,4 +187,4 @@ def test_all_scans_are_matched_anew_where_many_labels_changed(room, monkeypatch,
     iterations = stillmap.iterate(room.recording)
     for _ in range(3):
         next(iterations)
-    assert [one is not None for one in initial] == [False, False, is_refined]
+    assert [m_step is not None for m_step in initial] == [False, False, is_refined]

@@ -186,7 +186,7 @@ class OdometryFaults:
         is_slipping = self._slip.is_slipping(self._count, pose, guess)
         if increment is None:
             return guess
-        if not is_plausible(increment, seconds):
+        if not _is_plausible(increment, seconds):
             self._leaped_ns = ns
         if self._stands:
             return standing_prior(pose, increment)
@@ -261,7 +261,7 @@ class OdometryFaults:
         return Fault(first_ns, standing.T_map_base, standing)
 
 
-def is_plausible(step: Float, seconds: float) -> bool:
+def _is_plausible(step: Float, seconds: float) -> bool:
     """True if a robot can move by a step (3, 3) in that time."""
     return float(np.hypot(*step[:2, 2])) <= max(_LEAP, _MAX_SPEED * seconds)
 

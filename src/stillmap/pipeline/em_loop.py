@@ -264,14 +264,14 @@ def iterate(
         with stages.measure("m_step"), limit_blas_threads():  # (9)-(15)
             m_step = _m_step(recording, e, previous, options, poses, progress)
         progress("labelling beams", number, 0, 0)
-        iteration = label_poses(recording, options, number, e, m_step, stages, started)
+        iteration = _label_poses(recording, options, number, e, m_step, stages, started)
         previous = iteration.estimate.for_next_iteration()
         del m_step  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration
 
 
-def label_poses(
+def _label_poses(
     recording: Recording,
     options: Options,
     number: int,

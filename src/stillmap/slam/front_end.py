@@ -58,8 +58,8 @@ class FrontEnd:
         pose, before: (3, 3) T_map_base of the last scan and of the one before it; the same where
             the velocity is unknown.
         usual: running average of the explained share of each sensor, which sees its own side.
-        first_contradicting: the first of the scans that contradict the local map, more than those
-            since agree; None: none does.
+        first_contradicting: the first of the scans that contradict the local map, until as many
+            spaced ones agree; None: none does.
     """
 
     def __init__(self, options: OdometryOptions) -> None:
@@ -113,8 +113,6 @@ class FrontEnd:
         """A poor match, or one outside the prior that is more likely, and what it says."""
         usual = self.usual.get(sensor, 1.0)
         wider = widen_match(grid, scan, prior, alternative, match, usual)
-        if wider.widened:
-            return wider, Evidence.AGREES
         return wider, judge_scan(grid, scan, wider, usual)
 
     def weigh(self, t: int, T_map_base: Float, seconds: float, evidence: Evidence) -> None:
@@ -145,7 +143,8 @@ class FrontEnd:
     def learn(
         self, sensor: str | int, prior: MotionPrior, match: ScanMatch, seconds: float
     ) -> None:
-        """Update the running averages of noise and of the explained share.
+        """Update the running averages of noise and of the explained share; not while scans
+        contradict the map, which says nothing about them.
 
         Args:
             sensor: of the scan.
@@ -153,6 +152,8 @@ class FrontEnd:
             match: of the scan.
             seconds: usually between scans.
         """
+        if self.first_contradicting is not None:
+            return
         usual = self.usual.get(sensor, 1.0)
         if prior.is_odometry and not is_poor(match, usual):
             self._odometry_noise = self._odometry_noise.update(

@@ -20,7 +20,6 @@ from stillmap.slam import (
 from stillmap.slam.heading_alignment import align_headings
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
-from stillmap.slam.scan_matching import FAULT_COST
 from stillmap.slam.types import BareStretch, LoopClosure, LoopContext, MStepResult, ScanProgress
 
 KEYFRAME_DISTANCE, SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
@@ -241,6 +240,7 @@ def _to_constraint(keyframes: Index, closure: LoopClosure) -> Constraint:
 
 # keyframes on the earlier and the later side that count as nearby; chi-square up to which two agree
 _NEARBY, _MAX_AGREEMENT_CHI2 = np.array([8, 4]), 9.0
+_PROOF = 13.8  # nats of closures nearby: one correction in a million is wrong
 
 
 def reject_inconsistent(
@@ -248,7 +248,7 @@ def reject_inconsistent(
 ) -> list[LoopClosure]:
     """Rejects closures whose correction is not proved by those nearby.
 
-    The scores of those that agree, itself included, less those of the others must reach FAULT_COST.
+    The scores of those that agree, itself included, less those of the others must reach _PROOF.
     """
     accepted = _AcceptedLoops(context, chain, closures)
     out, n = [], 0
@@ -256,7 +256,7 @@ def reject_inconsistent(
         if not closure.rejected:
             others = accepted.nearby(n)
             sign = np.where(accepted.agree(n, others), 1.0, -1.0)
-            if closure.score + sign @ accepted.score[others] < FAULT_COST:
+            if closure.score + sign @ accepted.score[others] < _PROOF:
                 closure = closure.reject("nearby closures disagree")
             n += 1
         out.append(closure)

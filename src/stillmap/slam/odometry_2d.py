@@ -102,9 +102,12 @@ class _ScanOdometry:
         seconds, grid = float(self.seconds_before[t]), self.local_map.grid
         # without odometry, the first scan of a sensor with another view has nothing to match
         has_map = prior.is_odometry or self.local_map.has_sensor(s)
-        match, poor, evidence = accept_prior(prior), False, Evidence.AGREES
+        is_seen = len(scan.points) > 0 and self.local_map.has_sensor(s)
+        match, poor = accept_prior(prior), False
+        evidence = Evidence.AGREES if is_seen else Evidence.UNKNOWN
         if has_map:
             match, poor = front_end.match(grid, scan, s, prior, learned)
+            poor = poor and is_seen
         is_off = poor or is_inconsistent(learned or prior, match.T_map_base)
         after_gap = is_gap(seconds, self.seconds, (learned or prior).translation_std)
         if is_off and after_gap and self.search_wider:
@@ -117,7 +120,7 @@ class _ScanOdometry:
         front_end.weigh(t, match.T_map_base, seconds, evidence)
         self._record(t, match, is_fault=self._rejects_odometry(t, prior, alternative, match))
         self._note_drift(t, learned or prior, match, seconds)
-        if has_map:
+        if is_seen:
             front_end.learn(s, learned or prior, match, self.seconds)
         self.travelled += front_end.advance(match.T_map_base)
         if evidence is not Evidence.CONTRADICTS:
@@ -167,7 +170,7 @@ class _ScanOdometry:
     def _record(self, t: int, match: ScanMatch, *, is_fault: bool) -> None:
         self.poses[t], self.covariance[t] = match.T_map_base, match.covariance
         self.explained[t], self.widened[t] = match.explained, match.widened
-        self.odometry_faults[t] |= match.contradicts_odometry or is_fault
+        self.odometry_faults[t] = match.contradicts_odometry or is_fault
 
     def _note_drift(self, t: int, prior: MotionPrior, match: ScanMatch, seconds: float) -> None:
         self.drift[t] = motion_model.blind_drift(prior, match.covariance)

@@ -123,7 +123,7 @@ def _rematch(window: Recording, poses: Float, threads: int) -> Float:
     options = SlamOptions(resolution=_RESOLUTION)
     if window.dimension == 2:
         # a wider search would mend poses given that jump, and agree with none of their neighbours
-        found = register_scans(window, e, options, lambda *_: None, search_wider=False).poses
-        return se2.normalize(poses[0] @ se2.inverse(found[0]) @ found)
+        matched = register_scans(window, e, options, lambda *_: None, search_wider=False).poses
+        return se2.normalize(poses[0] @ se2.inverse(matched[0]) @ matched)
     sweeps = register_sweeps(window, e, options.odometry, lambda *_: None, threads, _MAX_POINTS)
     return se3.normalize(poses[0] @ se2.inverse(sweeps.poses[0]) @ sweeps.poses)

@@ -2,8 +2,8 @@
 
 Scan matching decides at each scan, before it sees where that leads. Where it found a scan outside
 odometry's prior, three hypotheses may explain the scans around it better: that odometry was right,
-that it failed at these scans only, or that it failed throughout. The one is taken whose map has the
-higher marginal likelihood.
+that it failed at these scans only, or that it failed throughout; and odometry alone may be better
+than all of them. The one is taken whose map has the higher marginal likelihood.
 """
 
 import dataclasses
@@ -129,12 +129,13 @@ def revise_steps(
     comparison = _Comparison(recording, e, options, matched, methods)
     closed = methods.close_loops(matched)
     best = _Choice(matched, closed, comparison.cost(closed))
+    odometry = comparison.follow_odometry(matched)
+    if odometry is not None and (cost := comparison.cost(odometry)) < best.cost:
+        closed = methods.close_loops(odometry)
+        best = _Choice(odometry, odometry, cost)
+        best = min(best, _Choice(odometry, closed, comparison.cost(closed)), key=lambda c: c.cost)
     if earlier is not None and comparison.cost(earlier) < best.cost:
         return earlier
-    odometry = comparison.follow_odometry(matched)
-    if odometry is not None and comparison.cost(odometry) < best.cost:
-        closed = methods.close_loops(odometry)
-        best = _Choice(odometry, closed, comparison.cost(closed))
     changed = np.ones(recording.n_scans, np.bool_)
     while alternatives := comparison.propose(best.matched, changed):
         before, best = best.matched, comparison.choose(best, alternatives)
@@ -165,8 +166,16 @@ class _Comparison:
         T = self.recording.T_odom_base
         if T is None:
             return None
-        poses = se2.normalize(se2.inverse(T[0]) @ T)
-        return dataclasses.replace(matched, poses=poses, loops=[], diagnostics=Diagnostics())
+        noise = np.zeros((len(T), 3, 3))  # of the steps, which no scan corrects
+        noise[1:] = np.square(self.odometry_cost.std)[:, :, None] * np.eye(3)
+        return dataclasses.replace(
+            matched,
+            poses=se2.normalize(se2.inverse(T[0]) @ T),
+            covariance=noise,
+            drift=noise,
+            loops=[],
+            diagnostics=Diagnostics(follows_odometry=True),
+        )
 
     def choose(self, best: _Choice, alternatives: list[_Alternative]) -> _Choice:
         """The more likely of a trajectory and the same with alternatives: all of them, or parts."""

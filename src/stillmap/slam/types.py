@@ -94,6 +94,7 @@ class Diagnostics(ShortRepr):
         ambiguous: first scans of segments that contradict the map where odometry leads, and fit
             nowhere else.
         bare_stretches: whose length the scans do not show, and no accepted loop measures.
+        follows_odometry: scan matching makes a less likely map than odometry.
     """
 
     widened: list[int] = field(default_factory=list)
@@ -102,6 +103,7 @@ class Diagnostics(ShortRepr):
     segments: list[int] = field(default_factory=list)
     ambiguous: list[int] = field(default_factory=list)
     bare_stretches: list[BareStretch] = field(default_factory=list)
+    follows_odometry: bool = False
 
 
 @dataclass(frozen=True)
