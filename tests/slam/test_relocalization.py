@@ -52,6 +52,12 @@ def test_relocalization_in_large_places(world, seed, beams, robot):
 
 
 @pytest.mark.slow
+def test_a_slow_robot_with_many_scans_is_noticed():
+    simulation = carried("office", 0, 90, scans=1500, speed=0.25, carried_at=0.6)
+    assert mapped(simulation.recording).diagnostics.segments == [900]
+
+
+@pytest.mark.slow
 def test_relocalization_among_people():
     # they hide so much that nothing explains 85 % of a scan
     robot = {"scans": 2000, "carried_at": 0.5, "carried_by": 20.0}

@@ -31,6 +31,9 @@ _MIN_TRAVEL = 8.0  # m after which directions are known
 # normals of one wall share their errors: evidence of each; std of a building's walls about its
 # directions, rad, which one metre of travel shows once
 _EVIDENCE, _MIN_STD = 0.1, np.radians(0.3)
+# share of the usual explained one below which nothing of a scan is in the local map, though the
+# robot moved on
+_NOTHING = 0.15
 _FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
 
 
@@ -239,6 +242,8 @@ class ScanOdometry:
         if poor:
             guess = front_end.predict() if prior.is_odometry else None
             match, evidence = front_end.search_wider(grid, scan, sensor, prior, guess, match)
+            if match.explained < _NOTHING * front_end.usual.get(sensor, 1.0):
+                evidence = Evidence.CONTRADICTS
         front_end.weigh(beams.stamp_ns, match.T_map_base, self._seconds_to(beams), evidence)
         is_outside = match.widened and is_inconsistent(prior, match.T_map_base)
         return match, match.contradicts_odometry or (prior.is_odometry and is_outside)

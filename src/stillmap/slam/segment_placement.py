@@ -126,11 +126,7 @@ class Segment:
                     continue
                 usual = float(context.explained[t])
                 match = scan_matching.match_scan(self._map, scan, prior, usual)
-                occluded = scan_matching.occluded_share(self._map, scan, match.T_map_base)
-                if (
-                    occluded <= scan_matching.MAX_OCCLUDED
-                    and match.explained >= loop_verification.MIN_EXPLAINED
-                ):
+                if match.explained >= loop_verification.MIN_EXPLAINED:
                     poses[t] = match.T_map_base
                     cost += scan_matching.motion_cost(prior, match)
                     moved = match.T_map_base @ se2.inverse(context.poses[t])
