@@ -124,13 +124,11 @@ def _find_latest(of: Index, near: Sequence[Index], stay: Bool) -> Bool:
 def _find_indispensable(
     travelled: Float, of: Index, keyframes: Index, fitting: Sequence[LoopClosure]
 ) -> Bool:
-    """(K,) keyframes of recent stretches, of those to which they are tied, and of those that no
-    loop ties to others."""
+    """(K,) keyframes of recent stretches, and of those that no loop ties to others."""
     ends = [(closure.earlier, closure.later) for closure in fitting]
     at = np.searchsorted(keyframes, np.array(ends, np.intp).reshape(-1, 2))
     recent = travelled > travelled[-1] - _RECENT
-    of_recent = of[at[recent[at[:, 1]]]]
-    return np.asarray(recent | np.isin(of, of_recent) | ~np.isin(of, of[at]))
+    return np.asarray(recent | ~np.isin(of, of[at]))
 
 
 def _find_standing(poses: Float, keyframes: Index) -> Bool:
