@@ -8,10 +8,10 @@ import stillmap
 from stillmap.core import se2
 from stillmap.em.options import EmOptions
 from stillmap.live.causal_labels import CausalLabels, take_over
-from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.loop_closer import Correction
 from stillmap.live.map_frame import MapCorrection, MapFrame
+from stillmap.live.registration import Registration
 from stillmap.live.scan import Observation, to_beams
 
 CARRIED = 7  # spaced scans before the robot was carried, 1 m apart; as many scans after each

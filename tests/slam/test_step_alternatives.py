@@ -9,6 +9,7 @@ from driven import ate, chained, prior, silent
 from rooms import drive
 from scipy.special import betaln
 
+import stillmap
 from stillmap import _core, em, slam
 from stillmap.core import se2
 from stillmap.slam import odometry_2d, step_alternatives
@@ -125,6 +126,7 @@ def test_odometry_is_followed_where_scan_matching_is_led_astray(monkeypatch):
         estimated = slam.m_step(given, prior(given), slam.SlamOptions(), None, 1, silent)
         assert (ate(estimated, simulation.truth) > 0.02) == is_led_astray
         assert estimated.diagnostics.follows_odometry != is_led_astray
+    assert any("odometry alone" in warning for warning in stillmap.build(recording).warnings)
 
 
 def test_an_iteration_keeps_poses_that_are_more_likely(monkeypatch):

@@ -11,10 +11,10 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
 from stillmap.core.parallel import trim_heap
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
-from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan, thin_scan
 from stillmap.live.loop_closer import Correction, LoopCloser, is_small
 from stillmap.live.loop_process import LoopProcess
+from stillmap.live.registration import Registration
 from stillmap.live.scan import Observation
 from stillmap.live.scan_odometry import ScanOdometry
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
@@ -29,7 +29,7 @@ SPACED_PER_TAG = {2: 4, 3: 1}
 _KEPT_EVERY_NS = {2: 0, 3: 500_000_000}  # between two of them
 _MIN_SHIFT = 0.5  # cells by which the map must move for its cells to be moved
 LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess
-FrontEnd = ScanOdometry | SweepOdometry
+LiveOdometry = ScanOdometry | SweepOdometry
 
 _log = logging.getLogger(__name__)
 
@@ -191,7 +191,7 @@ class MapFrame:
         labelled: Observation | None,
         added: MappedScan | None,
         labels: CausalLabels,
-        odometry: FrontEnd,
+        odometry: LiveOdometry,
     ) -> None:
         """Go on correcting the map after a scan, if loops were closed.
 
@@ -240,11 +240,11 @@ class MapFrame:
         self.add_drift(covariance)
         self._outdated = self._count
 
-    def finish_correction(self, labels: CausalLabels, odometry: FrontEnd) -> None:
+    def finish_correction(self, labels: CausalLabels, odometry: LiveOdometry) -> None:
         """Finish the correction that was begun, if there is one."""
         self._go_on(labels, odometry, to_the_end=True)
 
-    def _go_on(self, labels: CausalLabels, odometry: FrontEnd, *, to_the_end: bool) -> None:
+    def _go_on(self, labels: CausalLabels, odometry: LiveOdometry, *, to_the_end: bool) -> None:
         if self._correction is None:
             return
         is_done = self._correction.step(labels)

@@ -15,13 +15,13 @@ from stillmap.core.local_frame import Fields, Shift, shift, shift_poses
 from stillmap.core.parallel import resolve_threads
 from stillmap.em import CellProbabilities
 from stillmap.live.causal_labels import CausalLabels, MapChange
-from stillmap.live.front_end import Registration
 from stillmap.live.history import History
 from stillmap.live.known_map import KeptMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_process import LoopProcess, make_closer
-from stillmap.live.map_frame import FrontEnd, LoopClosing, MapFrame, rotate_covariance
+from stillmap.live.map_frame import LiveOdometry, LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.movers import Mover, MoverTracker
+from stillmap.live.registration import Registration
 from stillmap.live.robot_finder import Localizer, RobotFinder
 from stillmap.live.scan import BeamSelector, Observation, ScanBeams, deskew, find_margins
 from stillmap.live.scan_odometry import ScanOdometry, thin
@@ -82,7 +82,7 @@ class OnlineSlam:
         threads = resolve_threads(options.threads)
         self.dimension, self.resolution = D, slam.resolution
         spacing = None if place is None else _SEARCH_DISTANCE
-        self.odometry: FrontEnd = (
+        self.odometry: LiveOdometry = (
             ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads, spacing)
         )
         self.labels = CausalLabels(D, slam.resolution, options.em, threads)

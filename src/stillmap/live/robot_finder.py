@@ -9,7 +9,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import OwnMap, PlanarLocalizer
-from stillmap.live.map_frame import FrontEnd, MapFrame
+from stillmap.live.map_frame import LiveOdometry, MapFrame
 from stillmap.live.sweep_localization import SweepLocalizer
 
 Localizer = PlanarLocalizer | SweepLocalizer
@@ -80,7 +80,9 @@ class RobotFinder:
         """A scan agrees with what is seen since the robot was lost, or with the map."""
         self._last_agreed = scan
 
-    def lose(self, scan: int, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
+    def lose(
+        self, scan: int, labels: CausalLabels, frame: MapFrame, odometry: LiveOdometry
+    ) -> None:
         """The robot was carried before a scan: the labels begin anew, until it is found."""
         self._begin_stretch(scan)
         if self._carried is None:
@@ -110,7 +112,7 @@ class RobotFinder:
         pose: Float,
         scans: int,
         frame: MapFrame,
-        odometry: FrontEnd,
+        odometry: LiveOdometry,
     ) -> tuple[Float, Float] | None:
         """Search the robot in the map, in which labels and odometry then go on.
 

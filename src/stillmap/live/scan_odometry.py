@@ -8,9 +8,9 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
-from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan
 from stillmap.live.odometry_faults import DeadReckoning, Fault, OdometryFaults
+from stillmap.live.registration import Crowd, Registration
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.slam import motion_model, scan_hits
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
@@ -116,7 +116,7 @@ class ScanOdometry:
             increment: (3, 3) of odometry since the last scan; None: there is none.
         """
         if self._is_first:
-            return motion_model.gaussian_prior(np.eye(3), 1e-3, 1e-3)
+            return motion_model.gaussian_prior(self._front_end.pose, 1e-3, 1e-3)
         ns, seconds = beams.stamp_ns, self._seconds_to(beams)
         front_end = self._front_end
         return self._faults.predict(front_end.pose, front_end.predict(), increment, ns, seconds)
@@ -299,7 +299,7 @@ class ScanOdometry:
 
     @property
     def _is_contradicted(self) -> bool:
-        """True while scans contradict the local map."""
+        """True from a scan that contradicts the local map on, until others agree with it."""
         return self._front_end.first_contradicting is not None
 
     def _seconds_to(self, beams: ScanBeams) -> float:

@@ -6,9 +6,9 @@ import numpy as np
 
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float, Float32
-from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.known_cloud import KnownPlanes
 from stillmap.live.local_map import Labeller, MappedScan
+from stillmap.live.registration import Crowd, Registration
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import constant_velocity, lidar_odometry
 from stillmap.slam.constant_velocity import State

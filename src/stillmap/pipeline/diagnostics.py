@@ -58,7 +58,10 @@ def _input_warnings(best: Estimate, recording: Recording) -> Iterator[str]:
     if recording.T_odom_base is None and not (len(explained) and np.isnan(explained).all()):
         yield "no odometry: the robot was assumed to keep its velocity from one scan to the next"
     if best.m_step.diagnostics.follows_odometry:
-        yield "poses start from odometry alone: scan matching makes a less likely map"
+        yield advise(
+            "poses start from odometry alone: scan matching makes a less likely map",
+            "look for walls drawn twice: people who walk along with the robot mislead scans",
+        )
 
 
 def _length_warnings(best: Estimate) -> Iterator[str]:

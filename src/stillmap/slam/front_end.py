@@ -76,7 +76,7 @@ class FrontEnd:
 
     @property
     def is_carried(self) -> bool:
-        """True if scans show that the robot is elsewhere."""
+        """True if so many scans contradict the local map that the robot was carried elsewhere."""
         return self._contradictions >= _CARRIED_AFTER
 
     def predict(self) -> MotionPrior:
@@ -96,10 +96,10 @@ class FrontEnd:
         prior: MotionPrior,
         learned: MotionPrior | None,
     ) -> tuple[ScanMatch, bool]:
-        """The match of a scan within its prior, and whether it is a poor one."""
+        """The match of a scan within its prior, and whether it is a poor one: without hits, too."""
         usual = self.usual.get(sensor, 1.0)
         match = match_scan(grid, scan, prior, usual, learned)
-        return match, len(scan.points) > 0 and is_poor(match, usual)
+        return match, is_poor(match, usual)
 
     def search_wider(
         self,

@@ -132,8 +132,11 @@ def revise_steps(
     odometry = comparison.follow_odometry(matched)
     if odometry is not None and (cost := comparison.cost(odometry)) < best.cost:
         closed = methods.close_loops(odometry)
-        best = _Choice(odometry, odometry, cost)
-        best = min(best, _Choice(odometry, closed, comparison.cost(closed)), key=lambda c: c.cost)
+        choices = (
+            _Choice(odometry, odometry, cost),
+            _Choice(odometry, closed, comparison.cost(closed)),
+        )
+        best = min(choices, key=lambda choice: choice.cost)
     if earlier is not None and comparison.cost(earlier) < best.cost:
         return earlier
     changed = np.ones(recording.n_scans, np.bool_)

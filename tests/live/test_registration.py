@@ -8,7 +8,7 @@ import pytest
 from live_runs import answers, poses_of
 
 from stillmap.core import se2
-from stillmap.live.front_end import Crowd
+from stillmap.live.registration import Crowd
 from stillmap.live.scan_odometry import WallDirections, correct_heading
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
