@@ -36,11 +36,9 @@ def windows_of(poses, mount, rng, spacing=8):
     last = first + spacing
     motion = se2.parameters(se2.inverse(poses[first] @ X) @ poses[last] @ X)
     motion += rng.standard_normal(motion.shape) * NOISE
-    none = np.zeros(0, np.intp)
     covariance = np.tile(np.diag(np.square(NOISE)), (len(first), 1, 1))
-    steps = np.zeros((0, 2), np.intp)
     segment = np.arange(len(first)) // 2
-    return MotionWindows(first, last, segment, motion, covariance, steps, np.zeros(0), none)
+    return MotionWindows(first, last, segment, motion, covariance)
 
 
 def test_half_a_turn_is_no_negative_scale():

@@ -178,14 +178,9 @@ def _place_lasers(recording: Recording, found: Calibration) -> Recording:
 def _correct_odometry(recording: Recording, found: Calibration) -> Recording:
     assert recording.T_odom_base is not None
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
-    latency = found.odometry.get(LATENCY)
-    odometry = correct_odometry(
-        seconds,
-        recording.T_odom_base,
-        scale=found.odometry[SCALE].applied,
-        rotation_gain=found.odometry[GAIN].applied,
-        latency=0.0 if latency is None else latency.applied,
-    )
+    applied = {SCALE: 1.0, GAIN: 1.0, LATENCY: 0.0}
+    applied |= {name: parameter.applied for name, parameter in found.odometry.items()}
+    odometry = correct_odometry(seconds, recording.T_odom_base, **applied)
     return dataclasses.replace(recording, T_odom_base=odometry)
 
 

@@ -15,7 +15,6 @@ from stillmap.core.array_types import Bool, Float
 from stillmap.core.recording import Recording
 from stillmap.slam.motion_model import compute_odometry_steps
 from stillmap.slam.scan_motion import MotionWindows
-from stillmap.slam.turn_rates import sum_by_segment
 
 Values = dict[str, float]
 
@@ -247,7 +246,9 @@ class HandEye:
         cost = 0.5 * (nu + 3.0) * np.log1p(squares / (nu * scale)) + 1.5 * np.log(scale)
         std = {}
         if len(free):
-            scores = sum_by_segment(np.einsum("wip,wi->wp", WJ, r), self.segment)
+            scores = np.zeros((int(self.segment.max(initial=-1)) + 1, len(free)))
+            # residuals of one segment depend on each other: errors of its map, a slip
+            np.add.at(scores, self.segment, np.einsum("wip,wi->wp", WJ, r))
             std = dict(zip(free, _standard_deviations(A, scores), strict=True))
         return Fit(values, std, cost)
 
@@ -305,5 +306,4 @@ def mirror(one: MotionWindows) -> MotionWindows:
         one,
         motion=one.motion * sign,
         covariance=one.covariance * np.outer(sign, sign),
-        turns=-one.turns,
     )

@@ -22,15 +22,15 @@ from stillmap.slam.hand_eye import (
     SCALE,
     Fit,
     HandEye,
-    correct_odometry,
     difference,
     kind,
     laser_names,
     nominal_values,
 )
+from stillmap.slam.latency import fit_latency, shift_odometry
+from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import thin_scans
 from stillmap.slam.scan_motion import MotionWindows, measure_motion, select_segments
-from stillmap.slam.turn_rates import fit_latency
 
 YAW, POSITION, UPSIDE_DOWN, LATENCY = "theta", ("x", "y"), "upside_down", "latency"
 
@@ -47,9 +47,6 @@ _SUSPICIOUS = 0.8  # of these differences: more windows are measured
 _MIN_GAIN = 20.0  # nats by which a calibration, or mirrored scans, must agree better in all
 # segments in which a calibration must gain so many nats, and the sum of all gains over all losses
 _MIN_SEGMENTS, _CLEAR_GAIN, _MIN_RATIO = 3, 1.0, 3.0
-_MAX_INTERVAL = 0.3  # s between scans; slower ones do not show how late odometry is
-_MIN_EXPLAINED = 0.5  # share of odometry's turns that the scans' explain
-_HALVES = 0.35  # share of the latency by which either half of the segments may differ
 _SAME_SENSE = 0.5  # correlation of the turns of laser and odometry: the right way up
 _MAX_LASERS = 4  # more: a laser that moves on its robot has a pose for each scan
 _LIMITS = {SCALE: (0.4, 2.5), GAIN: (0.4, 2.5)}  # beyond, odometry says nothing of this robot
@@ -111,12 +108,23 @@ def calibrate_mounts(
     if recording.dimension != 2 or recording.T_odom_base is None or lasers > _MAX_LASERS:
         return Calibration()
     recording, _ = thin_scans(recording, recording.hit)
+    latency = _calibrate_latency(recording, resolution)
+    recording = shift_odometry(recording, latency.applied)
     given = list(given) or [()] * lasers
     windows = max(_LEAST_WINDOWS, min(_FIRST_WINDOWS, recording.n_scans // _SCANS_PER_WINDOW))
     found = _Calibrator(recording, resolution, given, windows).calibrate()
-    if not _is_suspicious(found):
-        return found
-    return _Calibrator(recording, resolution, given, _MORE_WINDOWS).calibrate()
+    if _is_suspicious(found):
+        found = _Calibrator(recording, resolution, given, _MORE_WINDOWS).calibrate()
+    if np.isfinite(latency.std):
+        found.odometry[LATENCY] = latency
+    return found
+
+
+def _calibrate_latency(recording: Recording, resolution: float) -> Parameter:
+    e = np.full(recording.n_beams, _P_STATIC, np.float32)
+    fit = fit_latency(recording, e, SlamOptions(resolution=resolution))
+    least = max(_MIN_DIFFERENCE[LATENCY], _STDS * fit.std)
+    return Parameter(0.0, fit.latency, fit.std, abs(fit.latency) > least and fit.gain > _MIN_GAIN)
 
 
 def _is_suspicious(found: Calibration) -> bool:
@@ -141,7 +149,6 @@ class _Calibrator:
     ) -> None:
         assert recording.T_odom_base is not None
         self.given, self.odometry = given, recording.T_odom_base
-        self.seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
         lasers = len(recording.T_base_sensor)
         centred = dataclasses.replace(recording, T_base_sensor=np.tile(np.eye(3), (lasers, 1, 1)))
         e = recording.allocate_per_beam(np.float32)
@@ -154,15 +161,10 @@ class _Calibrator:
         self.count = sum(len(one.first) for one in self.windows)
 
     def calibrate(self) -> Calibration:
-        """Latency, then which way up, then all else; what is not significant stays nominal."""
+        """Which way up, then all else; what is not significant stays nominal."""
         if min(len(one.first) for one in self.windows) < _MIN_WINDOWS:
             return Calibration(windows=self.count)
-        latency = self._latency()
         T = self.odometry
-        if latency is not None and latency.significant:
-            T = correct_odometry(
-                self.seconds, T, scale=1.0, rotation_gain=1.0, latency=latency.value
-            )
         upside_down = [self._is_upside_down(k, T) for k in range(len(self.windows))]
         problem = HandEye(self.windows, upside_down, T, self.nominal)
         free = [name for k in range(len(self.windows)) for name in self._free_names(k)]
@@ -175,8 +177,6 @@ class _Calibrator:
                 self.nominal[name], fit.values[name], fit.std[name], name in kept
             )
         odometry = {name: parameters[name] for name in (SCALE, GAIN)}
-        if latency is not None:
-            odometry[LATENCY] = latency
         lasers = [
             {kind(name): parameters[name] for name in self._free_names(k)}
             for k in range(len(self.windows))
@@ -185,30 +185,6 @@ class _Calibrator:
 
     def _free_names(self, laser: int) -> list[str]:
         return [name for name in laser_names(laser) if kind(name) not in self.given[laser]]
-
-    def _latency(self) -> Parameter | None:
-        """By the laser that shows it best; None where none does."""
-        fits = []
-        for one in self.windows:
-            steps = np.diff(self.seconds[one.steps], axis=1)
-            if float(np.median(steps)) <= _MAX_INTERVAL:
-                fits.append((fit_latency(one, self.seconds, self.odometry), one))
-        fits = [(fit, one) for fit, one in fits if fit.explained > _MIN_EXPLAINED]
-        if not fits:
-            return None
-        fit, one = min(fits, key=lambda pair: pair[0].std)
-        is_certain = abs(fit.latency) > max(_MIN_DIFFERENCE[LATENCY], _STDS * fit.std)
-        return Parameter(
-            0.0, fit.latency, fit.std, is_certain and self._halves_agree(one, fit.latency)
-        )
-
-    def _halves_agree(self, one: MotionWindows, latency: float) -> bool:
-        """True if every second segment alone shows about the same latency."""
-        segment = np.arange(int(one.segment.max()) + 1)
-        halves = (
-            fit_latency(one, self.seconds, self.odometry, segment % 2 == side) for side in (0, 1)
-        )
-        return all(abs(half.latency - latency) < _HALVES * abs(latency) for half in halves)
 
     def _is_upside_down(self, k: int, T: Float) -> bool:
         """True if a laser's motion agrees with odometry's only if its scans are mirrored."""

@@ -6,7 +6,7 @@ are those in which odometry says that the robot turns or travels most.
 """
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,7 +29,6 @@ _MAX_GAP = 10.0  # s between two scans of a segment
 # far off the centre), m and rad beyond
 _SEARCH_RATIO, _LEVER, _SEARCH_MARGIN = 1.4, 0.6, 0.1
 _MAX_SEARCH = 3.0  # m; where odometry starts again elsewhere its step says nothing
-_MAX_LATENESS = 0.5  # s by which odometry may be late: the step is the longest within it
 _LONG_STEP = 0.4  # m or rad: constant velocity says little about a step as long
 _VELOCITY_STD = 0.3  # m, rad: prior around constant velocity, hardly any
 _USUAL_SHARE, _USUAL_RATE = 0.9, 0.2  # as of following; of the running mean of the explained share
@@ -47,9 +46,6 @@ class MotionWindows:
         segment: (W,) the segment of each window.
         motion: (W, 3) x, y (m) and heading (rad) of the last scan in the frame of the first.
         covariance: (W, 3, 3) in that frame.
-        steps: (N, 2) successive scans.
-        turns: (N,) rad of the laser between them.
-        step_segment: (N,) the segment of each step.
     """
 
     first: Index
@@ -57,9 +53,6 @@ class MotionWindows:
     segment: Index
     motion: Float
     covariance: Float
-    steps: Index = field(default_factory=lambda: np.zeros((0, 2), np.intp))
-    turns: Float = field(default_factory=lambda: np.zeros(0))
-    step_segment: Index = field(default_factory=lambda: np.zeros(0, np.intp))
 
 
 def select_segments(recording: Recording, sensor: int, windows: int) -> list[Index]:
@@ -169,13 +162,11 @@ class _Tracker:
         """Motion between scans about a unit of odometry's motion apart."""
         self.local_map.add(int(self.scans[0]), self.poses[0], 0.0)
         ends, covariances, since, usual = [0], [np.zeros((3, 3))], 0.0, 0.0
-        kept = len(self.scans)
         for k in range(1, len(self.scans)):
             scan = scan_hits.select_hits(self.recording, self.e, int(self.scans[k]))
             match = self._match(k, scan, usual)
             if match.explained < _MIN_EXPLAINED:
-                kept = k  # lost: what follows is worth nothing
-                break
+                break  # lost: what follows is worth nothing
             usual += (_USUAL_RATE if k > 1 else 1.0) * (match.explained - usual)
             since += float(self.step_size[k - 1])
             if since >= WINDOW:
@@ -183,7 +174,7 @@ class _Tracker:
                 covariances.append(self._covariance(k, scan))
                 since = 0.0
             self.local_map.add(int(self.scans[k]), self.poses[k], 0.0)
-        return self._windows(ends, covariances, kept, segment)
+        return self._windows(ends, covariances, segment)
 
     def _match(self, k: int, scan: Scan, usual: float) -> ScanMatch:
         """The match of scan k, near constant velocity or by a search."""
@@ -236,45 +227,29 @@ class _Tracker:
         floor = np.diag(np.square([_FLOOR_STD[0], _FLOOR_STD[0], _FLOOR_STD[1]]))
         return np.asarray(covariance + floor)
 
-    def _windows(
-        self, ends: list[int], covariances: list[Float], kept: int, segment: int
-    ) -> MotionWindows:
+    def _windows(self, ends: list[int], covariances: list[Float], segment: int) -> MotionWindows:
         first, last = np.array(ends[:-1], np.intp), np.array(ends[1:], np.intp)
         motion = se2.parameters(se2.inverse(self.poses[first]) @ self.poses[last])
         both = np.array([a + b for a, b in itertools.pairwise(covariances)])
         in_frame = se2.rotate_covariance(both.reshape(-1, 3, 3), se2.inverse(self.poses[first]))
-        step = np.arange(max(kept - 1, 0))
-        turns = se2.parameters(se2.inverse(self.poses[step]) @ self.poses[step + 1])[:, 2]
-        steps = np.stack([self.scans[step], self.scans[step + 1]], axis=-1)
         return MotionWindows(
             self.scans[first],
             self.scans[last],
             np.full(len(first), segment),
             motion,
             in_frame,
-            steps,
-            turns,
-            np.full(len(step), segment),
         )
 
 
 def _search_windows(recording: Recording, scans: Index) -> tuple[Float, Float]:
     """(N - 1,) half widths in m and rad that hold the step to each next scan of the laser,
-    whichever way it is mounted and if odometry is late."""
+    whichever way it is mounted."""
     odometry = recording.T_odom_base
     assert odometry is not None
-    stamps = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
     x, y, turn = np.abs(se2.parameters(se2.increments(odometry))).T
-    travelled = np.concatenate([[0.0], np.hypot(x, y).cumsum()])
-    turned = np.concatenate([[0.0], turn.cumsum()])
-    lateness = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None] * _MAX_LATENESS
-    begin, end = stamps[scans[:-1]] + lateness, stamps[scans[1:]] + lateness
-
-    def longest(sum_: Float) -> Float:
-        steps = np.interp(end, stamps, sum_) - np.interp(begin, stamps, sum_)
-        return np.asarray(steps.max(axis=0))
-
-    metres, radians = longest(travelled), longest(turned)
+    metres, radians = (
+        np.diff(np.append(0.0, size.cumsum())[scans]) for size in (np.hypot(x, y), turn)
+    )
     radius = _SEARCH_RATIO * metres + _LEVER * radians + _SEARCH_MARGIN
     angle = np.minimum(_SEARCH_RATIO * radians + _SEARCH_MARGIN, np.pi)
     return np.minimum(radius, _MAX_SEARCH), angle

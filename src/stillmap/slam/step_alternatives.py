@@ -182,17 +182,21 @@ class _Comparison:
 
     def choose(self, best: _Choice, alternatives: list[_Alternative]) -> _Choice:
         """The more likely of a trajectory and the same with alternatives: all of them, or parts."""
-        matched = best.matched
-        for alternative in alternatives:
-            matched = alternative.replace_in(matched)
-        closed = self.methods.close_loops(matched)
-        cost = self.cost(closed)
-        if cost < best.cost:
-            return _Choice(matched, closed, cost)
-        if len(alternatives) == 1:
-            return best
-        half = len(alternatives) // 2
-        return self.choose(self.choose(best, alternatives[:half]), alternatives[half:])
+        while alternatives:
+            matched = best.matched
+            for alternative in alternatives:
+                matched = alternative.replace_in(matched)
+            closed = self.methods.close_loops(matched)
+            if (cost := self.cost(closed)) < best.cost:
+                return _Choice(matched, closed, cost)
+            # the map of all scans shows which of them it is not
+            gains = [self._gain_within(best.closed, closed, each) for each in alternatives]
+            likely = [each for each, gain in zip(alternatives, gains, strict=True) if gain > 0.0]
+            least = alternatives[int(np.argmin(gains))]
+            alternatives = likely or [each for each in alternatives if each is not least]
+            if len(likely) == len(gains):
+                alternatives.remove(least)
+        return best
 
     def propose(self, matched: MStepResult, changed: Bool) -> list[_Alternative]:
         """Alternatives that the scans around them make more likely, in the order of the scans.
@@ -252,6 +256,18 @@ class _Comparison:
                 cost += self._scan_cost(self._close_part(trajectory, start, end), start)
             costs.append(cost)
         return costs[0] - costs[1]
+
+    def _gain_within(
+        self, before: MStepResult, after: MStepResult, alternative: _Alternative
+    ) -> float:
+        """The same of two trajectories with loops closed, the latter with the alternative."""
+        first, last = _window(self.travelled, alternative.a, alternative.b, _COMPARED)
+        cost, cost_after = (
+            self.odometry_cost(closed.poses, first + 1, last)
+            + self._scan_cost(closed.poses[first:last], first)
+            for closed in (before, after)
+        )
+        return cost - cost_after
 
     def cost(self, closed: MStepResult) -> float:
         """Nats, -ln of the probability of all scans and steps, up to a constant."""

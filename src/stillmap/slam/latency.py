@@ -1,0 +1,98 @@
+"""Latency of odometry: the one at which its steps are the likeliest, given the poses of scans."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32
+from stillmap.core.recording import Recording
+from stillmap.slam.hand_eye import correct_odometry
+from stillmap.slam.odometry_2d import register_scans
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.trajectory_cost import OdometryCost
+
+MAX_LATENCY = 3.0  # s, early or late, that is tried
+_STEPS = 0.25, 0.05, 0.01  # s, of one grid after the other around the best
+_MAX_SCANS = 1000  # that are matched: those of the stretch with the most rotation
+_ROUNDS = 6  # of matching and fitting, at most
+_MAX_TRAVEL = 25.0  # m after which they leave the local map
+
+
+class LatencyFit(NamedTuple):
+    """The latency of odometry.
+
+    Attributes:
+        latency: s; negative: early.
+        std: s; infinite where the recording does not show it.
+        gain: nats by which the steps are more likely than without latency.
+    """
+
+    latency: float = 0.0
+    std: float = np.inf
+    gain: float = 0.0
+
+
+def fit_latency(recording: Recording, e: Float32, options: SlamOptions) -> LatencyFit:
+    """The latency that minimises the cost of the steps of matched scans, given odometry.
+
+    Odometry as recorded draws matches, and the fit, towards zero: scans are matched again.
+
+    Args:
+        recording: 2D, with odometry.
+        e: (M,) P(static) of every beam.
+        options: see SlamOptions.
+    """
+    first, last = _busiest_stretch(recording)
+    e = e[recording.offset[first] : recording.offset[last]]
+    recording = recording.slice_scans(first, last)
+    fit = LatencyFit()
+    for _ in range(_ROUNDS):
+        matched = register_scans(
+            shift_odometry(recording, fit.latency), e, options, lambda *_: None, _MAX_TRAVEL
+        )
+        before, fit = fit, _fit_to_poses(recording, matched.poses, options)
+        if abs(fit.latency - before.latency) <= _STEPS[-1]:
+            break
+    return fit
+
+
+def _fit_to_poses(recording: Recording, poses: Float, options: SlamOptions) -> LatencyFit:
+    """The same given the poses (T, 3, 3) of all scans."""
+
+    def cost(latency: float) -> float:
+        shifted = shift_odometry(recording, latency)
+        return OdometryCost(shifted, poses, options.odometry)(poses, 1, len(poses))
+
+    best, width = 0.0, MAX_LATENCY
+    for step in _STEPS:
+        tried = best + step * np.arange(-round(width / step), round(width / step) + 1)
+        best, width = min(tried.tolist(), key=cost), step
+    h, least = _STEPS[1], cost(best)
+    curvature = (cost(best - h) + cost(best + h) - 2.0 * least) / h**2
+    if abs(best) >= MAX_LATENCY or curvature <= 0.0:
+        return LatencyFit()
+    return LatencyFit(best, curvature**-0.5, cost(0.0) - least)
+
+
+def shift_odometry(recording: Recording, latency: float) -> Recording:
+    """The recording with odometry corrected that is so many s late."""
+    if latency == 0.0:
+        return recording
+    assert recording.T_odom_base is not None
+    seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
+    odometry = correct_odometry(
+        seconds, recording.T_odom_base, scale=1.0, rotation_gain=1.0, latency=latency
+    )
+    return dataclasses.replace(recording, T_odom_base=odometry)
+
+
+def _busiest_stretch(recording: Recording) -> tuple[int, int]:
+    """First scan and one after the last of those in which odometry turns most."""
+    assert recording.T_odom_base is not None
+    turns = np.abs(se2.parameters(se2.increments(recording.T_odom_base))[:, 2])
+    turned = np.append(0.0, turns.cumsum())
+    n = min(_MAX_SCANS, len(turned))
+    first = int(np.argmax(turned[n - 1 :] - turned[: len(turned) - n + 1]))
+    return first, first + n
