@@ -237,10 +237,10 @@ class ScanOdometry:
             return accept_prior(learned or prior), False
         if self._reckoning.is_far and prior.is_odometry:
             return self._find_again(beams, scan, learned or prior), False
-        match, poor = front_end.match(grid, scan, sensor, prior, learned)
+        guess = front_end.predict() if prior.is_odometry else None
+        match, poor = front_end.match(grid, scan, sensor, prior, learned, guess)
         evidence = Evidence.AGREES
         if poor:
-            guess = front_end.predict() if prior.is_odometry else None
             match, evidence = front_end.search_wider(grid, scan, sensor, prior, guess, match)
             if match.explained < _NOTHING * front_end.usual.get(sensor, 1.0):
                 evidence = Evidence.CONTRADICTS

@@ -17,7 +17,14 @@ from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.scan_hits import Scan
-from stillmap.slam.scan_matching import ScanMatch, is_poor, match_scan, widen_match
+from stillmap.slam.scan_matching import (
+    ScanMatch,
+    compare_priors,
+    is_inconsistent,
+    is_poor,
+    match_scan,
+    widen_match,
+)
 
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _AGREE_SHARE, _CONTRADICT_SHARE = 0.6, 0.4  # explained, of the usual share
@@ -95,10 +102,15 @@ class FrontEnd:
         sensor: str | int,
         prior: MotionPrior,
         learned: MotionPrior | None,
+        alternative: MotionPrior | None,
     ) -> tuple[ScanMatch, bool]:
-        """The match of a scan within its prior, and whether it is a poor one: without hits, too."""
+        """The match of a scan within its prior or, if odometry fails, an alternative to it; and
+        whether it is a poor one: without hits, too."""
         usual = self.usual.get(sensor, 1.0)
         match = match_scan(grid, scan, prior, usual, learned)
+        is_apart = alternative is not None and is_inconsistent(prior, alternative.T_map_base)
+        if alternative is not None and is_apart and prior.is_odometry and len(scan.points):
+            match = compare_priors(grid, scan, learned or prior, alternative, match, usual)
         return match, is_poor(match, usual)
 
     def search_wider(

@@ -82,7 +82,7 @@ class _ScanOdometry:
         self.poses = np.tile(np.eye(3), (T, 1, 1))
         self.covariance, self.explained = np.zeros((T, 3, 3)), np.ones(T)
         self.drift, self.unmeasured = np.zeros((T, 3, 3)), np.zeros(T)
-        self.widened, self.odometry_faults = np.zeros((2, T), np.bool_)
+        self.widened, self.odometry_faults, self.possible_faults = np.zeros((3, T), np.bool_)
         self.breaks = list[int]()
         self.steps = (
             None
@@ -106,7 +106,7 @@ class _ScanOdometry:
         match, poor = accept_prior(prior), False
         evidence = Evidence.AGREES if is_seen else Evidence.UNKNOWN
         if has_map:
-            match, poor = front_end.match(grid, scan, s, prior, learned)
+            match, poor = front_end.match(grid, scan, s, prior, learned, alternative)
             poor = poor and is_seen
         is_off = poor or is_inconsistent(learned or prior, match.T_map_base)
         after_gap = is_gap(seconds, self.seconds, (learned or prior).translation_std)
@@ -171,6 +171,7 @@ class _ScanOdometry:
         self.poses[t], self.covariance[t] = match.T_map_base, match.covariance
         self.explained[t], self.widened[t] = match.explained, match.widened
         self.odometry_faults[t] = match.contradicts_odometry or is_fault
+        self.possible_faults[t] = match.may_be_fault
 
     def _note_drift(self, t: int, prior: MotionPrior, match: ScanMatch, seconds: float) -> None:
         self.drift[t] = motion_model.blind_drift(prior, match.covariance)
@@ -181,6 +182,7 @@ class _ScanOdometry:
         diagnostics = Diagnostics(
             np.flatnonzero(self.widened).tolist(),
             np.flatnonzero(self.odometry_faults).tolist(),
+            np.flatnonzero(self.possible_faults).tolist(),
             self.breaks,
             bare_stretches=_find_bare_stretches(self.unmeasured, self.poses, self.breaks),
         )

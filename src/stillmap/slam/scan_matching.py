@@ -57,6 +57,7 @@ class ScanMatch:
             additional cost in nats.
         widened: found only by a wider search than the prior's window.
         contradicts_odometry: odometry was rejected.
+        may_be_fault: as likely if odometry failed, but for its rarity.
     """
 
     T_map_base: Float
@@ -66,6 +67,7 @@ class ScanMatch:
     alternatives: Float
     widened: bool = False
     contradicts_odometry: bool = False
+    may_be_fault: bool = False
 
 
 def match_scan(
@@ -95,6 +97,33 @@ def match_scan(
 def is_poor(match: ScanMatch, usual: float) -> bool:
     """True if a map explains much less of a scan than usual."""
     return match.explained < _WIDEN_BELOW * usual
+
+
+def compare_priors(
+    grid: _core.OccupancyGrid2D,
+    scan: Scan,
+    prior: MotionPrior,
+    alternative: MotionPrior,
+    match: ScanMatch,
+    usual: float,
+) -> ScanMatch:
+    """The match within the prior of odometry, or within another if that it fails is likelier.
+
+    Args:
+        grid: the map so far.
+        scan: its hits, at least one.
+        prior: of odometry.
+        alternative: at constant velocity.
+        match: within the prior of odometry.
+        usual: recent average of the explained share.
+    """
+    failed = match_scan(grid, scan, alternative, usual)
+    costs = (one.cost + motion_cost(of, one) for of, one in ((prior, match), (alternative, failed)))
+    gain = next(costs) - next(costs)
+    if gain > FAULT_COST:
+        contradicts = is_inconsistent(prior, failed.T_map_base)
+        return dataclasses.replace(failed, widened=True, contradicts_odometry=contradicts)
+    return dataclasses.replace(match, may_be_fault=gain > 0.0)
 
 
 def widen_match(

@@ -80,6 +80,7 @@ class _Alternative:
             matched.diagnostics,
             widened=self._replace_scans(matched, "widened"),
             odometry_faults=self._replace_scans(matched, "odometry_faults"),
+            possible_faults=self._replace_scans(matched, "possible_faults"),
         )
         return dataclasses.replace(
             matched,
@@ -226,7 +227,9 @@ class _Comparison:
     def _match_again(self, matched: MStepResult, changed: Bool) -> Iterator[_Alternative]:
         """Steps that differ if odometry is right, fails at scans found far off, or throughout."""
         widened = np.array(matched.diagnostics.widened, np.intp)
-        rejected = np.union1d(widened, np.array(matched.diagnostics.odometry_faults, np.intp))
+        diagnostics = matched.diagnostics
+        faults = diagnostics.odometry_faults + diagnostics.possible_faults
+        rejected = np.union1d(widened, np.array(faults, np.intp))
         for is_wide, without_odometry in ((False, False), (True, False), (True, True)):
             if is_wide and self.recording.T_odom_base is None:
                 return
@@ -234,10 +237,10 @@ class _Comparison:
             at = at[changed[at]]
             for first, last in _windows(self.travelled, at):
                 part, e = self._select(first, last)
-                faults = widened[(first < widened) & (widened < last)] - first
+                inside = widened[(first < widened) & (widened < last)] - first
                 source = part.without_odometry() if without_odometry else part
                 steps = self.methods.match_part(
-                    source, e, is_wide, faults if is_wide else faults[:0]
+                    source, e, is_wide, inside if is_wide else inside[:0]
                 )
                 for a, b in _differences(matched.poses[first:last], steps.poses):
                     # whether the robot was carried is decided where segments are placed

@@ -88,6 +88,7 @@ class Diagnostics(ShortRepr):
     Attributes:
         widened: matched only by a wider search.
         odometry_faults: odometry was rejected.
+        possible_faults: that odometry failed is as likely, but for its rarity.
         breaks: first scans after the robot was carried elsewhere; before loop closure, those
             before which it may have been.
         segments: first scans of all segments that were placed, those that follow by odometry too.
@@ -99,6 +100,7 @@ class Diagnostics(ShortRepr):
 
     widened: list[int] = field(default_factory=list)
     odometry_faults: list[int] = field(default_factory=list)
+    possible_faults: list[int] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
     segments: list[int] = field(default_factory=list)
     ambiguous: list[int] = field(default_factory=list)
