@@ -11,6 +11,7 @@ from stillmap.core.recording import Recording
 from stillmap.slam.hand_eye import correct_odometry
 from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
+from stillmap.slam.scan_hits import select_beams
 from stillmap.slam.trajectory_cost import OdometryCost
 
 MAX_LATENCY = 3.0  # s, early or late, that is tried
@@ -44,9 +45,7 @@ def fit_latency(recording: Recording, e: Float32, options: SlamOptions) -> Laten
         e: (M,) P(static) of every beam.
         options: see SlamOptions.
     """
-    first, last = _busiest_stretch(recording)
-    e = e[recording.offset[first] : recording.offset[last]]
-    recording = recording.slice_scans(first, last)
+    recording, e = _select_scans(recording, e)
     fit = LatencyFit()
     for _ in range(_ROUNDS):
         matched = register_scans(
@@ -88,11 +87,14 @@ def shift_odometry(recording: Recording, latency: float) -> Recording:
     return dataclasses.replace(recording, T_odom_base=odometry)
 
 
-def _busiest_stretch(recording: Recording) -> tuple[int, int]:
-    """First scan and one after the last of those in which odometry turns most."""
+def _select_scans(recording: Recording, e: Float32) -> tuple[Recording, Float32]:
+    """The stretch in which odometry turns most, of the first laser: others may be mounted amiss."""
     assert recording.T_odom_base is not None
-    turns = np.abs(se2.parameters(se2.increments(recording.T_odom_base))[:, 2])
-    turned = np.append(0.0, turns.cumsum())
-    n = min(_MAX_SCANS, len(turned))
+    scans = np.flatnonzero(recording.sensor == recording.sensor[0])
+    turns = np.abs(se2.parameters(se2.increments(recording.T_odom_base[scans]))[:, 2])
+    turned, n = np.append(0.0, turns.cumsum()), min(_MAX_SCANS, len(scans))
     first = int(np.argmax(turned[n - 1 :] - turned[: len(turned) - n + 1]))
-    return first, first + n
+    scans = scans[first : first + n]
+    beams = [np.arange(*recording.offset[t : t + 2]) for t in scans.tolist()]
+    part = select_beams(recording, scans, beams, recording.T_odom_base[scans])
+    return part, e[np.concatenate(beams)]

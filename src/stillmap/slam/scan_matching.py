@@ -120,7 +120,7 @@ def compare_priors(
     failed = match_scan(grid, scan, alternative, usual)
     costs = (one.cost + motion_cost(of, one) for of, one in ((prior, match), (alternative, failed)))
     gain = next(costs) - next(costs)
-    if gain > FAULT_COST:
+    if gain > FAULT_COST and not is_poor(failed, usual):
         contradicts = is_inconsistent(prior, failed.T_map_base)
         return dataclasses.replace(failed, widened=True, contradicts_odometry=contradicts)
     return dataclasses.replace(match, may_be_fault=gain > 0.0)

@@ -1,9 +1,9 @@
 """Alternatives to steps of incremental scan matching, compared by the evidence of their maps.
 
-Scan matching decides at each scan, before it sees where that leads. Where it found a scan outside
-odometry's prior, three hypotheses may explain the scans around it better: that odometry was right,
-that it failed at these scans only, or that it failed throughout; and odometry alone may be better
-than all of them. The one is taken whose map has the higher marginal likelihood.
+Scan matching decides at each scan, before it sees where that leads. Where odometry failed there, or
+may have, three hypotheses may explain the scans around it better: that it was right, that it failed
+at these scans only, or that it failed throughout. And odometry alone may be better than all of
+them. The one is taken whose map has the higher marginal likelihood.
 """
 
 import dataclasses
@@ -288,25 +288,24 @@ class _Comparison:
 
     def _close_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
         """Poses of the scans from first to last - 1 with the loops among them closed."""
-        part, e = self._select(first, last)
+        matched = self._part(trajectory, first, last)
+        return self.methods.close_part(*self._select(first, last), matched).poses
+
+    def _part(self, trajectory: MStepResult, first: int, last: int) -> MStepResult:
+        """The scans from first to last - 1, without what is known of other scans."""
         scans = slice(first, last)
-        drift = None if trajectory.drift is None else trajectory.drift[scans]
-        matched = MStepResult(
+        return MStepResult(
             trajectory.poses[scans],
             trajectory.covariance[scans],
             trajectory.grid,
             trajectory.explained[scans],
-            drift,
+            None if trajectory.drift is None else trajectory.drift[scans],
         )
-        return self.methods.close_part(part, e, matched).poses
 
     def _select(self, first: int, last: int) -> tuple[Recording, Float32]:
         """The scans from first to last - 1 and the e of their beams."""
-        recording, scans = self.recording, np.arange(first, last)
-        beams = [np.arange(*recording.offset[t : t + 2]) for t in scans.tolist()]
-        odometry = None if recording.T_odom_base is None else recording.T_odom_base[scans]
-        part = scan_hits.select_beams(recording, scans, beams, odometry)
-        return part, self.e[recording.offset[first] : recording.offset[last]]
+        offset = self.recording.offset
+        return self.recording.slice_scans(first, last), self.e[offset[first] : offset[last]]
 
 
 def _changed_steps(before: MStepResult, after: MStepResult) -> Bool:
