@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from driven import picked
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
@@ -91,6 +92,15 @@ def test_odometry(errors, name, value):
     found = calibrate_mounts(with_odometry(**errors), RESOLUTION)
     assert significant(found) == {name}
     assert found.odometry[name].value == pytest.approx(value, abs=0.03)
+
+
+@pytest.mark.parametrize("latency", [2.0, -1.5])
+def test_latency_of_slow_scans(latency):
+    recording = with_odometry(latency=-latency)
+    slow = picked(recording, np.arange(0, recording.n_scans, 8))  # 1.6 s
+    found = calibrate_mounts(slow, RESOLUTION).odometry["latency"]
+    assert found.significant
+    assert found.value == pytest.approx(latency, abs=0.1)
 
 
 def test_the_second_of_two_lasers():

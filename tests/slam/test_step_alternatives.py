@@ -5,14 +5,16 @@ import importlib
 
 import numpy as np
 import pytest
-from driven import ate, chained, prior, silent
+from driven import ate, chained, picked, prior, silent
 from rooms import drive
 from scipy.special import betaln
 
 import stillmap
 from stillmap import _core, em, slam
 from stillmap.core import se2
+from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import odometry_2d, step_alternatives
+from stillmap.slam.options import SlamOptions
 
 M_STEP = importlib.import_module("stillmap.slam.m_step")  # the package has a function of that name
 
@@ -146,3 +148,20 @@ def test_an_iteration_keeps_poses_that_are_more_likely(monkeypatch):
     kept = slam.m_step(recording, e, options, None, 1, silent, earlier=first)
     assert ate(torn, simulation.truth) > 0.5
     assert ate(kept, simulation.truth) < 0.02
+
+
+@pytest.mark.parametrize("first", [10, 18])
+def test_odometry_stalls_along_a_corridor(first):
+    # scans fit where the robot was before, too
+    scene = scene_by_name("office", {"robot": {"scans": 400}})
+    recording = picked(simulate(scene, 3).recording, np.arange(0, 400, 5))
+    steps = se2.increments(recording.T_odom_base)
+    steps[first : first + 4] = np.eye(3)
+    stalled = dataclasses.replace(recording, T_odom_base=chained(steps))
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    poses, found = (
+        slam.m_step(given, e, SlamOptions(), None, 1, silent, with_grid=False).poses
+        for given in (recording, stalled)
+    )
+    d = se2.parameters(se2.inverse(poses) @ found)
+    assert np.hypot(d[:, 0], d[:, 1]).max() < 0.15
