@@ -110,7 +110,7 @@ class FrontEnd:
         match = match_scan(grid, scan, prior, usual, learned)
         is_apart = alternative is not None and is_inconsistent(prior, alternative.T_map_base)
         if alternative is not None and is_apart and prior.is_odometry and len(scan.points):
-            match = compare_priors(grid, scan, learned or prior, alternative, match, usual)
+            match = compare_priors(grid, scan, prior, learned, alternative, match, usual)
         return match, is_poor(match, usual)
 
     def search_wider(

@@ -103,26 +103,29 @@ def compare_priors(
     grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
+    learned: MotionPrior | None,
     alternative: MotionPrior,
     match: ScanMatch,
     usual: float,
 ) -> ScanMatch:
-    """The match within the prior of odometry, or within another if that it fails is likelier.
+    """The match within the prior of odometry, or outside it if that odometry fails is likelier.
 
     Args:
         grid: the map so far.
         scan: its hits, at least one.
         prior: of odometry.
+        learned: as of `match_scan`.
         alternative: at constant velocity.
         match: within the prior of odometry.
         usual: recent average of the explained share.
     """
     failed = match_scan(grid, scan, alternative, usual)
-    costs = (one.cost + motion_cost(of, one) for of, one in ((prior, match), (alternative, failed)))
-    gain = next(costs) - next(costs)
+    if not is_inconsistent(prior, failed.T_map_base):
+        return match
+    cost = match.cost + motion_cost(learned or prior, match)
+    gain = cost - failed.cost - motion_cost(alternative, failed)
     if gain > FAULT_COST and not is_poor(failed, usual):
-        contradicts = is_inconsistent(prior, failed.T_map_base)
-        return dataclasses.replace(failed, widened=True, contradicts_odometry=contradicts)
+        return dataclasses.replace(failed, widened=True, contradicts_odometry=True)
     return dataclasses.replace(match, may_be_fault=gain > 0.0)
 
 
