@@ -159,9 +159,9 @@ def test_odometry_stalls_along_a_corridor(first):
     steps[first : first + 4] = np.eye(3)
     stalled = dataclasses.replace(recording, T_odom_base=chained(steps))
     e = np.full(recording.n_beams, 0.9, np.float32)
-    poses, found = (
+    expected, estimated = (
         slam.m_step(given, e, SlamOptions(), None, 1, silent, with_grid=False).poses
         for given in (recording, stalled)
     )
-    d = se2.parameters(se2.inverse(poses) @ found)
+    d = se2.parameters(se2.inverse(expected) @ estimated)
     assert np.hypot(d[:, 0], d[:, 1]).max() < 0.15

@@ -20,7 +20,6 @@ from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
     ScanMatch,
     compare_priors,
-    is_inconsistent,
     is_poor,
     match_scan,
     widen_match,
@@ -108,8 +107,7 @@ class FrontEnd:
         whether it is a poor one: without hits, too."""
         usual = self.usual.get(sensor, 1.0)
         match = match_scan(grid, scan, prior, usual, learned)
-        is_apart = alternative is not None and is_inconsistent(prior, alternative.T_map_base)
-        if alternative is not None and is_apart and prior.is_odometry and len(scan.points):
+        if prior.is_odometry and alternative is not None and len(scan.points):
             match = compare_priors(grid, scan, prior, learned, alternative, match, usual)
         return match, is_poor(match, usual)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.core.array_types import Float, Float32
+from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
 from stillmap.slam.hand_eye import correct_odometry
 from stillmap.slam.odometry_2d import register_scans
@@ -35,17 +35,18 @@ class LatencyFit(NamedTuple):
     gain: float = 0.0
 
 
-def fit_latency(recording: Recording, e: Float32, options: SlamOptions) -> LatencyFit:
+def fit_latency(recording: Recording, p_static: float, options: SlamOptions) -> LatencyFit:
     """The latency that minimises the cost of the steps of matched scans, given odometry.
 
     Odometry as recorded draws matches, and the fit, towards zero: scans are matched again.
 
     Args:
         recording: 2D, with odometry.
-        e: (M,) P(static) of every beam.
+        p_static: of every beam.
         options: see SlamOptions.
     """
-    recording, e = _select_scans(recording, e)
+    recording = _select_scans(recording)
+    e = np.full(recording.n_beams, p_static, np.float32)
     fit = LatencyFit()
     for _ in range(_ROUNDS):
         matched = register_scans(
@@ -87,7 +88,7 @@ def shift_odometry(recording: Recording, latency: float) -> Recording:
     return dataclasses.replace(recording, T_odom_base=odometry)
 
 
-def _select_scans(recording: Recording, e: Float32) -> tuple[Recording, Float32]:
+def _select_scans(recording: Recording) -> Recording:
     """The stretch in which odometry turns most, of the first laser: others may be mounted amiss."""
     assert recording.T_odom_base is not None
     scans = np.flatnonzero(recording.sensor == recording.sensor[0])
@@ -96,5 +97,4 @@ def _select_scans(recording: Recording, e: Float32) -> tuple[Recording, Float32]
     first = int(np.argmax(turned[n - 1 :] - turned[: len(turned) - n + 1]))
     scans = scans[first : first + n]
     beams = [np.arange(*recording.offset[t : t + 2]) for t in scans.tolist()]
-    part = select_beams(recording, scans, beams, recording.T_odom_base[scans])
-    return part, e[np.concatenate(beams)]
+    return select_beams(recording, scans, beams, recording.T_odom_base[scans])

@@ -112,17 +112,16 @@ def calibrate_mounts(
     recording = shift_odometry(recording, latency.applied)
     given = list(given) or [()] * lasers
     windows = max(_LEAST_WINDOWS, min(_FIRST_WINDOWS, recording.n_scans // _SCANS_PER_WINDOW))
-    found = _Calibrator(recording, resolution, given, windows).calibrate()
-    if _is_suspicious(found):
-        found = _Calibrator(recording, resolution, given, _MORE_WINDOWS).calibrate()
+    calibration = _Calibrator(recording, resolution, given, windows).calibrate()
+    if _is_suspicious(calibration):
+        calibration = _Calibrator(recording, resolution, given, _MORE_WINDOWS).calibrate()
     if np.isfinite(latency.std):
-        found.odometry[LATENCY] = latency
-    return found
+        calibration.odometry[LATENCY] = latency
+    return calibration
 
 
 def _calibrate_latency(recording: Recording, resolution: float) -> Parameter:
-    e = np.full(recording.n_beams, _P_STATIC, np.float32)
-    fit = fit_latency(recording, e, SlamOptions(resolution=resolution))
+    fit = fit_latency(recording, _P_STATIC, SlamOptions(resolution=resolution))
     least = max(_MIN_DIFFERENCE[LATENCY], _STDS * fit.std)
     return Parameter(0.0, fit.latency, fit.std, abs(fit.latency) > least and fit.gain > _MIN_GAIN)
 

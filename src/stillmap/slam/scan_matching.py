@@ -119,6 +119,8 @@ def compare_priors(
         match: within the prior of odometry.
         usual: recent average of the explained share.
     """
+    if not is_inconsistent(prior, alternative.T_map_base):
+        return match
     failed = match_scan(grid, scan, alternative, usual)
     if not is_inconsistent(prior, failed.T_map_base):
         return match

@@ -7,6 +7,7 @@ them. The one is taken whose map has the higher marginal likelihood.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -138,8 +139,12 @@ def revise_steps(
             _Choice(odometry, closed, comparison.cost(closed)),
         )
         best = min(choices, key=lambda choice: choice.cost)
-    if earlier is not None and comparison.cost(earlier) < best.cost:
-        return earlier
+    if earlier is not None:
+        # labels given the earlier poses agree with those: without them
+        mean = np.full_like(e, e.mean())
+        unlabelled = _Comparison(recording, mean, options, matched, methods)
+        if unlabelled.cost(earlier) < unlabelled.cost(best.closed):
+            return earlier
     changed = np.ones(recording.n_scans, np.bool_)
     while alternatives := comparison.propose(best.matched, changed):
         before, best = best.matched, comparison.choose(best, alternatives)
@@ -190,13 +195,10 @@ class _Comparison:
             closed = self.methods.close_loops(matched)
             if (cost := self.cost(closed)) < best.cost:
                 return _Choice(matched, closed, cost)
-            # the map of all scans shows which of them it is not
+            # their map shows which of them are wrong; if none stands out, the least likely
             gains = [self._gain_within(best.closed, closed, each) for each in alternatives]
-            likely = [each for each, gain in zip(alternatives, gains, strict=True) if gain > 0.0]
-            least = alternatives[int(np.argmin(gains))]
-            alternatives = likely or [each for each in alternatives if each is not least]
-            if len(likely) == len(gains):
-                alternatives.remove(least)
+            least = 0.0 if min(gains) <= 0.0 else min(gains)
+            alternatives = list(itertools.compress(alternatives, np.greater(gains, least)))
         return best
 
     def propose(self, matched: MStepResult, changed: Bool) -> list[_Alternative]:
@@ -226,8 +228,8 @@ class _Comparison:
 
     def _match_again(self, matched: MStepResult, changed: Bool) -> Iterator[_Alternative]:
         """Steps that differ if odometry is right, fails at scans found far off, or throughout."""
-        widened = np.array(matched.diagnostics.widened, np.intp)
         diagnostics = matched.diagnostics
+        widened = np.array(diagnostics.widened, np.intp)
         faults = diagnostics.odometry_faults + diagnostics.possible_faults
         rejected = np.union1d(widened, np.array(faults, np.intp))
         for is_wide, without_odometry in ((False, False), (True, False), (True, True)):
