@@ -141,8 +141,7 @@ def revise_steps(
         best = min(choices, key=lambda choice: choice.cost)
     if earlier is not None:
         # labels given the earlier poses agree with those: without them
-        mean = np.full_like(e, e.mean())
-        unlabelled = _Comparison(recording, mean, options, matched, methods)
+        unlabelled = _Comparison(recording, np.ones_like(e), options, matched, methods)
         if unlabelled.cost(earlier) < unlabelled.cost(best.closed):
             return earlier
     changed = np.ones(recording.n_scans, np.bool_)
