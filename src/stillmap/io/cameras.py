@@ -12,7 +12,7 @@ quaternion = [-0.5, 0.5, -0.5, 0.5]
 
 import io
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.core.array_types import Float
+from stillmap.core.array_types import Float, Int32, Int64
 from stillmap.core.camera import Camera, Images
 from stillmap.core.config import CheckedOptions, load_toml, override
 from stillmap.core.errors import InputError
@@ -214,10 +214,18 @@ def apply_camera_file(recording: Recording, path: Path) -> Recording:
 
 def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Images:
     """The images of one camera, from stamps (ns) and files in any order."""
-    ordered = sorted(files, key=lambda pair: pair[0])
-    stamp_ns = np.array([stamp for stamp, _ in ordered], np.int64)
-    number = np.zeros(len(ordered), np.int32)
-    return Images(stamp_ns, number, (camera,), lambda image: read_image(ordered[image][1]))
+    stamp_ns = np.array([stamp for stamp, _ in files], np.int64)
+    number = np.zeros(len(files), np.int32)
+    return order_images(stamp_ns, number, (camera,), lambda image: read_image(files[image][1]))
+
+
+def order_images(
+    stamp_ns: Int64, camera: Int32, cameras: Sequence[Camera], load: Callable[[int], NDArray[Any]]
+) -> Images:
+    """Images of stamps (N,) in any order, by which `load` reads them."""
+    order = np.argsort(stamp_ns, kind="stable")
+    in_order = stamp_ns[order], camera[order]
+    return Images(*in_order, tuple(cameras), lambda image: load(int(order[image])))
 
 
 def merge_images(parts: Sequence[Images]) -> Images:
@@ -232,16 +240,13 @@ def merge_images(parts: Sequence[Images]) -> Images:
     number_of = np.concatenate(
         [np.array([numbers[each.name] for each in part.cameras])[part.camera] for part in parts]
     )
-    part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    number = np.concatenate([np.arange(len(part)) for part in parts])
-    order = np.argsort(stamp_ns, kind="stable")
-    part_of, number = part_of[order].tolist(), number[order].tolist()
-    return Images(
-        stamp_ns[order],
-        number_of[order].astype(np.int32),
-        tuple(cameras.values()),
-        lambda image: parts[part_of[image]].read(number[image]),
-    )
+    sources = [(part, image) for part in parts for image in range(len(part))]
+
+    def load(image: int) -> NDArray[Any]:
+        part, number = sources[image]
+        return part.read(number)
+
+    return order_images(stamp_ns, number_of.astype(np.int32), tuple(cameras.values()), load)
 
 
 def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Images:
@@ -252,9 +257,7 @@ def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Im
         if given is not None:
             cameras[number] = given.apply_to(camera)
             stamp_ns[images.camera == number] += given.time_offset_ns
-    order = np.argsort(stamp_ns, kind="stable")
-    numbers, stamp_ns = images.camera[order], stamp_ns[order]
-    return Images(stamp_ns, numbers, tuple(cameras), lambda k: images.read(int(order[k])))
+    return order_images(stamp_ns, images.camera, cameras, images.read)
 
 
 def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) -> Images:

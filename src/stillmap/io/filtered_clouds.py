@@ -252,16 +252,10 @@ def _copy_records(source: IO[bytes], target: IO[bytes], layout: TableLayout, mas
             records = records[~removed]
         else:
             records = records.copy()
-            for axis in "xyz":
-                records[axis][removed] = _unknown(layout, axis)
+            table.erase_coordinates(records, removed)
         target.write(_pack(records, layout.path) if layout.compressed else records.tobytes())
     packed_size = int.from_bytes(source.read(8)[:4], "little") if layout.compressed else 0
     source.seek(packed_size or layout.rows * layout.dtype.itemsize, os.SEEK_CUR)
-
-
-def _unknown(layout: TableLayout, axis: str) -> float:
-    """The value of a coordinate that is not known."""
-    return np.nan if layout.dtype[axis].base.kind == "f" else 0
 
 
 def _pack(records: NDArray[np.void], path: Path) -> bytes:
@@ -273,7 +267,8 @@ def _pack(records: NDArray[np.void], path: Path) -> bytes:
 
 
 def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Bool) -> None:
-    unknown = {layout.count_values(axis): b"%g" % _unknown(layout, axis) for axis in "xyz"}
+    values = {axis: table.unknown_value(layout.dtype[axis]) for axis in "xyz"}
+    unknown = {layout.count_values(axis): b"%g" % value for axis, value in values.items()}
     row = 0
     while row < len(mask):
         line = source.readline()

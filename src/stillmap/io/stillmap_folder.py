@@ -191,8 +191,6 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     # np.diff could overflow
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
         raise _damaged_error(path, "stamp_ns", "stamps decrease")
-    if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
-        raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
     _check_points(path, points, hit)
     try:
         return Recording(

@@ -1,7 +1,6 @@
 """Poses as files write them: TUM trajectories (`stamp x y z qx qy qz qw`, stamps in s, exact to 1
 ns), matrices, quaternions; poses at stamps."""
 
-import decimal
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +14,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import MAX_STAMP_NS, format_seconds
+from stillmap.core.timestamps import format_seconds, parse_ns
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -181,13 +180,11 @@ def pose_rows(poses: Float) -> Float:
 
 def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
     try:
-        # Decimal has 28 digits: a stamp of 19 keeps 9 beyond the nanosecond before it is rounded
-        stamp = int(decimal.Decimal(words[0]).scaleb(9).to_integral_value())
-        row = [float(word) for word in words[1:]]
-    except (ValueError, decimal.DecimalException, OverflowError):
+        stamp, row = parse_ns(words[0]), [float(word) for word in words[1:]]
+    except ValueError:
         stamp, row = 0, []
     # plain Python: NumPy takes ten times as long for so few numbers
-    is_pose = len(row) == 7 and all(map(math.isfinite, row)) and abs(stamp) <= MAX_STAMP_NS
+    is_pose = len(row) == 7 and all(map(math.isfinite, row))
     is_near = is_pose and max(map(abs, row[:3])) < MAX_TRANSLATION
     if not is_near or abs(math.hypot(*row[3:]) - 1) > _UNIT_TOLERANCE:
         hint = f"a line is '{_COLUMNS}' in seconds and metres, its quaternion of length one"
@@ -219,6 +216,15 @@ def interpolate(stamp_ns: Int64, poses: Float, at_ns: Int64) -> tuple[Float, int
     step[:, 2] = se2.wrap(step[:, 2])
     outside = int(np.count_nonzero((at_ns < stamp_ns[0]) | (at_ns > stamp_ns[-1])))
     return poses[before] + share * step, outside
+
+
+def describe_odometry(
+    origin: str | None, outside: int, warnings: list[str]
+) -> dict[str, str | int | None]:
+    """Notes on odometry for `Source`; warns of scans outside its time."""
+    if outside:
+        warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
+    return {"from": origin, "outside": outside}
 
 
 _TOLERANCE_NS = 20_000_000  # other tools round stamps

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from stillmap.core import se3
 from stillmap.core.array_types import Float
 from stillmap.core.recording import Recording
 
@@ -138,6 +139,5 @@ def _rotation_to_z(up: Float) -> Float:
     axis, cosine = np.cross(up, z), float(up @ z)
     if cosine < -1.0 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
-    x, y, w = axis
-    W = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
+    W = se3.skew(axis)
     return np.asarray(np.eye(3) + W + W @ W / (1.0 + cosine))

@@ -84,8 +84,7 @@ def leave_out_far_returns(
     far = np.concatenate(blocks)
     if not len(far):
         return recording, []
-    points = arrays.copy(recording.points, recording.scratch)
-    hit = arrays.copy(recording.hit, recording.scratch)
+    points, hit = recording.copy_beams()
     returns, free = far[recording.hit[far]], far[~recording.hit[far]]
     points[returns], hit[returns] = np.nan, False
     kept = replace(recording, points=points, hit=hit)
@@ -179,8 +178,7 @@ def leave_out_far_scans(
     far = np.flatnonzero(distance > reach)
     if not len(far):
         return recording, []
-    points = arrays.copy(recording.points, recording.scratch)
-    hit = arrays.copy(recording.hit, recording.scratch)
+    points, hit = recording.copy_beams()
     for t in far.tolist():
         beams = recording.beams_of(t)
         points[beams], hit[beams] = np.nan, False

@@ -14,7 +14,6 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
-from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.core.source import BodyBox
@@ -81,8 +80,7 @@ def remove_self_returns(recording: Recording) -> Recording:
     known = {k: mask for k, mask in masks.items() if mask is not None}
     if not known:
         return recording
-    points = arrays.copy(recording.points, recording.scratch)
-    hit = arrays.copy(recording.hit, recording.scratch)
+    points, hit = recording.copy_beams()
     counts = dict.fromkeys(known, 0)
     for scan in recording.iter_scans(range(recording.n_scans), points, hit):
         sensor, beams = int(recording.sensor[scan]), recording.beams_of(scan)

@@ -277,7 +277,7 @@ def _find_odometry(
         odom_ns = np.concatenate([laser.stamp_ns for laser in lasers if laser.kind in own])
         odom = np.concatenate(list(own.values()))
     if not len(odom):
-        return None, {"from": None, "outside": 0}
+        return None, trajectory.describe_odometry(None, 0, warnings)
     poses, outside = [], 0
     for laser in lasers:
         at_scans, n_outside = own.get(laser.kind), 0
@@ -288,12 +288,11 @@ def _find_odometry(
     out = np.concatenate(poses)
     interpolated = "ODOM lines" if len(log.odom_rows) else "other lasers' scan lines"
     kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(lasers) else [])
-    if outside:
-        warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
+    notes = trajectory.describe_odometry(" and ".join(kinds), outside, warnings)
     if len(out) > 1 and not _moves(out):
         todo = "if the robot did, map without odometry"
         warnings.append(advise("the odometry never moves", todo))
-    return out, {"from": " and ".join(kinds), "outside": outside}
+    return out, notes
 
 
 def _moves(poses: Float) -> bool:

@@ -51,48 +51,42 @@ class CloudSource(NamedTuple):
 
 
 def read_clouds(
-    path: Path,
-    format: str,
+    notes: Source,
     extensions: tuple[str, ...],
     read_cloud: Callable[..., Cloud],
     context: ReadContext,
+    *,
+    in_sensor_frame: bool = False,
 ) -> Recording:
-    """Read a file or folder of clouds without sensor poses.
+    """Read a file of one cloud, or a folder of such files, with the stamps that names hold.
 
     Args:
-        path: of the file or folder.
-        format: its name.
-        extensions: of its files.
+        notes: path and format.
+        extensions: of the files.
         read_cloud: reads one file, given the common `origin` and a `scratch` folder.
         context: see ReadContext.
+        in_sensor_frame: see `Origin.add_notes`.
 
     Raises:
         InputError: no cloud can be read.
     """
-    origin = Origin()
+    path, origin = Path(str(notes.path)), Origin()
     read_cloud = partial(read_cloud, origin=origin, scratch=context.scratch)
-    sources = sources_of(files_of(path, extensions), extensions, read_cloud)
-    notes = Source(str(path), format=format)
+    files = files_of(path, extensions)
+    names = [strip_extension(file.name, extensions) for file in files]
+    stamps: Sequence[int | None] = stamps_from_names(names) or [None] * len(files)
+    sources = [
+        CloudSource(file.name, partial(read_cloud, file), stamp)
+        for file, stamp in zip(files, stamps, strict=True)
+    ]
     recording = build_recording(sources, notes, context, single=path.is_file())
-    origin.add_notes(recording)
+    origin.add_notes(recording, in_sensor_frame=in_sensor_frame)
     return recording
 
 
 def files_of(path: Path, extensions: tuple[str, ...]) -> list[Path]:
     """A file itself, or the files of a folder."""
     return [path] if path.is_file() else list_files(path, extensions)
-
-
-def sources_of(
-    files: Sequence[Path], extensions: tuple[str, ...], read_cloud: Callable[[Path], Cloud]
-) -> list[CloudSource]:
-    """A source per file, with the stamp that its name holds."""
-    names = [strip_extension(file.name, extensions) for file in files]
-    stamps: Sequence[int | None] = stamps_from_names(names) or [None] * len(files)
-    return [
-        CloudSource(file.name, partial(read_cloud, file), stamp)
-        for file, stamp in zip(files, stamps, strict=True)
-    ]
 
 
 def build_recording(
@@ -267,17 +261,19 @@ class Origin:
         with np.errstate(over="ignore"):
             return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
-    def place(self, recording: Recording) -> None:
-        """Let the recorded poses of scans whose points were shifted say so, in place: they are the
-        scans without a rotation and a position, beside others that have them."""
-        T = recording.T_recorded_base
-        if T is not None and self.position is not None:
-            is_unplaced = np.equal(T, np.eye(4)).all(axis=(1, 2))
-            T[is_unplaced, :3, 3] = self.position
-
     def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
         """Note the origin in the source of a recording, and warn that the sensor is assumed there;
-        neither where points are `in_sensor_frame` and near its origin."""
+        neither where points are `in_sensor_frame` and near its origin.
+
+        Of a recording with poses those of scans whose points were shifted say so instead: they are
+        the scans without a rotation and a position, beside others that have them.
+        """
+        T = recording.T_recorded_base
+        if T is not None:
+            if self.position is not None:
+                is_unplaced = np.equal(T, np.eye(4)).all(axis=(1, 2))
+                T[is_unplaced, :3, 3] = self.position
+            return
         if self.position is not None and np.any(self.position != 0.0):
             recording.source.origin = tuple(self.position.tolist())
             at = " ".join(f"{value:.0f}" for value in self.position)

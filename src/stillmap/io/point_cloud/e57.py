@@ -67,9 +67,7 @@ def read(path: Path, context: ReadContext) -> Recording:
     single = path.is_file() and len(sources) == 1
     notes = Source(str(path), format="E57")
     recording = build_recording(sources, notes, context, single=single)
-    origin.place(recording)
-    if recording.T_recorded_base is None:
-        origin.add_notes(recording)
+    origin.add_notes(recording)
     return recording
 
 

@@ -15,6 +15,7 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import (
     Cloud,
@@ -45,7 +46,8 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no cloud can be read, or laspy is missing.
     """
     import_extra("laspy", path)
-    return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, context)
+    notes = Source(str(path), format="LAS")
+    return read_clouds(notes, EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:

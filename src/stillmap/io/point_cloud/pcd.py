@@ -108,22 +108,18 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no scan can be read.
     """
-    files, origin = clouds.files_of(path, EXTENSIONS), Origin()
     notes = Source(str(path), format="PCD")
-    in_map_frame = _detect_map_frame(files)
+    in_map_frame = _detect_map_frame(clouds.files_of(path, EXTENSIONS))
     if in_map_frame:
         text = "points are in the map frame: transformed to the sensor frame by VIEWPOINT"
         notes.warnings.append(text)
-    read_cloud = partial(_read_cloud, in_map_frame=in_map_frame, origin=origin)
-    sources = clouds.sources_of(files, EXTENSIONS, read_cloud)
-    recording = clouds.build_recording(sources, notes, context, single=path.is_file())
-    origin.place(recording)
-    if recording.T_recorded_base is None:
-        origin.add_notes(recording, in_sensor_frame=True)
-    return recording
+    read_cloud = partial(_read_cloud, in_map_frame=in_map_frame)
+    return clouds.read_clouds(notes, EXTENSIONS, read_cloud, context, in_sensor_frame=True)
 
 
-def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
+def _read_cloud(
+    path: Path, origin: Origin, scratch: Path | None = None, *, in_map_frame: bool = False
+) -> Cloud:
     layout, T = read_header(path)
     T_sensor_map = np.eye(4) if T is None or not in_map_frame else se2.inverse(T)
     time = table.find_time_column(layout.dtype.names or ())
@@ -136,7 +132,7 @@ def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
             return points
         return points.astype(np.float64) @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3]
 
-    points, times = table.gather_points(table.read_columns(layout, names), to_sensor)
+    points, times = table.gather_points(table.read_columns(layout, names), to_sensor, scratch)
     return Cloud(points, T, times[0] if times else None)
 
 
@@ -154,7 +150,7 @@ def _detect_map_frame(files: list[Path]) -> bool:
                 farthest, at = file, float(np.linalg.norm(T[:3, 3]))
     with suppress(InputError, OSError, MemoryError):
         if farthest is not None:
-            points, T, *_ = _read_cloud(farthest, False, Origin())
+            points, T, *_ = _read_cloud(farthest, Origin())
             points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
             if T is not None and len(points):
                 from_origin = np.median(np.linalg.norm(points, axis=1))

@@ -8,6 +8,7 @@ from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
+from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.clouds import Cloud, Origin, iter_map_points, read_clouds
 from stillmap.io.point_cloud.table import (
@@ -41,7 +42,8 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no cloud can be read.
     """
-    return read_clouds(path, "PLY", EXTENSIONS, _read_cloud, context)
+    notes = Source(str(path), format="PLY")
+    return read_clouds(notes, EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:

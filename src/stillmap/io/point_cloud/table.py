@@ -166,6 +166,17 @@ def _unpack(file: InputFile, layout: TableLayout) -> NDArray[np.void]:
     return records
 
 
+def erase_coordinates(points: NDArray[np.void], mask: Bool) -> None:
+    """Make coordinates unknown where a mask of their shape says so: NaN, or 0 of integers."""
+    for axis in "xyz":
+        points[axis][mask] = unknown_value(points.dtype[axis])
+
+
+def unknown_value(kind: np.dtype[Any]) -> float:
+    """The value of a coordinate that is not known."""
+    return np.nan if kind.base.kind == "f" else 0
+
+
 def require_all(blocks: Iterable[Columns], rows: int, path: Path) -> Iterator[Columns]:
     """Yield the blocks of a table of `rows` points; negative: any number.
 

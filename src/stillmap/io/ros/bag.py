@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, Qos, QosDurability
@@ -93,7 +93,7 @@ _STORAGES: dict[bytes, tuple[str, Callable[[Path], Any]]] = {  # by first bytes:
 
 
 class _IndexedFile:
-    """See `_File`; any error of rosbags means damage."""
+    """A file read by rosbags, with the attributes of `DamagedFile`; any error means damage."""
 
     def __init__(self, kind: str, reader: Any) -> None:
         self.kind, self._reader, self.damage = kind, reader, SkippedRecords()
@@ -101,7 +101,7 @@ class _IndexedFile:
         self.close = reader.close
 
     def records(self, wanted: Collection[int], since_ns: int | None) -> Iterator[Record]:
-        """See `_File`."""
+        """The messages of these channels, from a log time on."""
         connections = [c for c in self._reader.connections if c.id in wanted]
         source = self._reader.messages(connections, start=since_ns) if connections else iter(())
         while True:
@@ -135,22 +135,7 @@ def _channel(connection: Any) -> Channel:
     return channel
 
 
-class _File(Protocol):
-    """A file of a bag.
-
-    Attributes:
-        kind: readable name.
-        channels: by their number in the file.
-        damage: unreadable parts by reason and byte position.
-    """
-
-    kind: str
-    channels: dict[int, Channel]
-    damage: SkippedRecords
-
-    def records(self, wanted: Collection[int], since_ns: int | None) -> Iterator[Record]:
-        """The messages of these channels, from a log time on."""
-        ...
+_File = _IndexedFile | DamagedFile
 
 
 class Bag:

@@ -9,6 +9,7 @@ from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
+from stillmap.io.point_cloud.table import erase_coordinates
 from stillmap.io.ros.bag import Bag, read_bag
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.limits import count_output
@@ -127,10 +128,7 @@ def _blank_points(cloud: Any, mask: Bool, topic: str) -> None:
         raise InputError(f"has another cloud on {topic} than was mapped")
     data = np.array(cloud.data, np.uint8)
     if layout.shape[0] > 1:
-        points = layout.view(data)
-        for axis in "xyz":
-            is_float = points[axis].dtype.kind == "f"
-            points[axis][mask.reshape(layout.shape)] = np.nan if is_float else 0
+        erase_coordinates(layout.view(data), mask.reshape(layout.shape))
         cloud.data, cloud.is_dense = data, False
         return
     step = layout.dtype.itemsize

@@ -13,7 +13,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.cameras import open_image, to_array
+from stillmap.io.cameras import open_image, order_images, to_array
 from stillmap.io.ros.bag import Bag
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
@@ -71,11 +71,10 @@ class ImageCollector:
         headers = [header for header in self._headers if header[2] in topics]
         if not headers:
             return None
-        headers.sort(key=lambda header: header[0])
-        return Images(
+        return order_images(
             np.array([stamp for stamp, _, _ in headers], np.int64),
             np.array([topics.index(topic) for _, _, topic in headers], np.int32),
-            tuple(self._camera(topic, tree, base) for topic in topics),
+            [self._camera(topic, tree, base) for topic in topics],
             lambda image: _load_image(reopen(), *headers[image]),
         )
 

@@ -27,7 +27,7 @@ from stillmap.io.ros.messages import (
     stamp_ns,
 )
 from stillmap.prepare.lasers import Beams, RawLaser, RawLasers, scan_order, unit_vectors
-from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 REPEATED = "scan that was recorded twice"
 
@@ -128,7 +128,7 @@ class LaserScans:
             [unit_vectors(s.angles()).astype(np.float32) for s in shapes],
             _beam_steps(stamps[keep], shapes),
             usual.range_min,
-            usual.range_max if 0.0 < usual.range_max < MAX_PLAUSIBLE_RANGE else None,
+            usual.range_max,
         )
 
     @property

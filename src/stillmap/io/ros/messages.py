@@ -10,16 +10,18 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
 from stillmap.io.builder import SkippedRecords
+from stillmap.io.text_lines import list_files
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 BagKind = Literal["bag", "ros2", "db3", "mcap"]
 
-ENDINGS = (".bag", ".db3", ".mcap")
+_STORAGE_ENDINGS = (".db3", ".mcap")
+_COMPRESSED_ENDINGS = (".db3.zstd", ".mcap.zstd")
+ENDINGS = (".bag", *_STORAGE_ENDINGS)
 BAG1_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 DB3_MAGIC = b"SQLite format 3\0"
@@ -96,7 +98,7 @@ def is_bag(path: Path, start: bytes | None) -> bool:
 
 def is_compressed(path: Path, start: bytes) -> bool:
     """True if a file of a ROS 2 folder is compressed as a whole."""
-    return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(_ZSTD_MAGIC)
+    return path.name.endswith(_COMPRESSED_ENDINGS) and start.startswith(_ZSTD_MAGIC)
 
 
 def detect_kind(path: Path) -> tuple[BagKind, bool]:
@@ -113,15 +115,7 @@ def detect_kind(path: Path) -> tuple[BagKind, bool]:
 
 def storage_files(folder: Path) -> list[Path]:
     """The files of a ROS 2 folder that hold messages, bag_2 before bag_10."""
-
-    def natural_order(path: Path) -> tuple[list[int], str]:
-        return [int(digits[:18]) for digits in re.findall("[0-9]+", path.name)], path.name
-
-    try:
-        files = sorted(folder.iterdir(), key=natural_order)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
-    return [f for f in files if f.name.removesuffix(".zstd").endswith((".db3", ".mcap"))]
+    return list_files(folder, (*_STORAGE_ENDINGS, *_COMPRESSED_ENDINGS))
 
 
 def decode(message: Message) -> Any:

@@ -14,7 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.timestamps import order_in_time
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.io.trajectory import MAX_TRANSLATION
+from stillmap.io.trajectory import MAX_TRANSLATION, describe_odometry
 from stillmap.prepare.options import ReadOptions
 
 BAD_TRANSFORM = "transform that is none"
@@ -350,7 +350,8 @@ def find_odometry(
     odom = frame or (tree.parent(moving[0]) if moving else None) or ""
     poses = tree.lookup(odom, base, at_ns) if odom in tree.frames else None
     if poses is not None and poses.moves:
-        return poses.T, _describe(f"TF from {odom} to {base}", poses.outside, warnings)
+        origin = f"TF from {odom} to {base}"
+        return poses.T, describe_odometry(origin, poses.outside, warnings)
     for topic in sorted(odometry, key=lambda o: -len(o.stamp_ns)):
         if frame in (None, topic.frame):
             topic.sort()
@@ -361,12 +362,5 @@ def find_odometry(
                 text = f"used as the pose of {base}, although it is of {topic.child}"
                 warnings.append(f"{topic.topic}: {text}")
             T = T if T_child_base is None else T @ T_child_base.T
-            return T, _describe(topic.topic, outside, warnings)
-    return None, {"from": None, "outside": 0}
-
-
-def _describe(origin: str, outside: int, warnings: list[str]) -> dict[str, Any]:
-    """Notes on odometry; warns of scans outside its time."""
-    if outside:
-        warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
-    return {"from": origin, "outside": outside}
+            return T, describe_odometry(topic.topic, outside, warnings)
+    return None, describe_odometry(None, 0, warnings)
