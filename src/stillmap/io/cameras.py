@@ -29,13 +29,7 @@ from stillmap.core.config import CheckedOptions, load_toml, override
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
-from stillmap.io.text_lines import (
-    list_files,
-    read_times,
-    stamp_files,
-    stamps_from_names,
-    strip_extension,
-)
+from stillmap.io import text_lines
 from stillmap.io.trajectory import pose_from_quaternion, pose_from_row, rigid_transform
 
 # counts of the numbers of each distortion model
@@ -262,14 +256,16 @@ def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Im
 
 def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) -> Images:
     """Images of a folder outside the recording."""
-    files = list_files(folder, EXTENSIONS)
+    files = text_lines.list_files(folder, EXTENSIONS)
     if not files:
         raise InputError("holds no images", where=str(folder))
     if given.times is not None:
         file = where.parent / given.times
-        used = stamp_files(files, read_times(file), file)
+        used = text_lines.stamp_files(files, text_lines.read_times(file), file)
     else:
-        named = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
+        named = text_lines.stamps_from_names(
+            [text_lines.strip_extension(file.name, EXTENSIONS) for file in files]
+        )
         if named is None:
             hint = f"times = 'FILE' in camera '{name}' of {where}: one line of seconds per image"
             raise InputError("holds images whose names are no stamps", where=str(folder), hint=hint)

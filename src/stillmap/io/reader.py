@@ -17,14 +17,7 @@ from stillmap.core.array_types import Float, Int32
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.source import Part, SensorNotes, Skipped, Source
-from stillmap.io import cameras
-from stillmap.io.builder import (
-    MAX_LINE_NUMBERS,
-    ReadContext,
-    explain_failure,
-    part_context,
-    reorder_scans,
-)
+from stillmap.io import builder, cameras
 from stillmap.io.registry import Format, detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import MAX_MOUNT, is_rigid
@@ -57,8 +50,8 @@ def read(
         InputError: there is no readable recording.
     """
     path, options = Path(path), options or ReadOptions()
-    with explain_failure(path):
-        raw = detect_format(path).read([path], ReadContext(options, progress, scratch), ())
+    with builder.explain_failure(path):
+        raw = detect_format(path).read([path], builder.ReadContext(options, progress, scratch), ())
         return _finish(interpret(raw, options, scratch), options, scratch, str(path))
 
 
@@ -84,8 +77,8 @@ def read_parts(
     files, options = [Path(path) for path in paths], options or ReadOptions()
     if not files:
         raise InputError("no recording is named")
-    context = ReadContext(options, progress, scratch)
-    with explain_failure(files[0]):
+    context = builder.ReadContext(options, progress, scratch)
+    with builder.explain_failure(files[0]):
         forms = [detect_format(path) for path in files]
         joins = forms[0].joins and all(form is forms[0] for form in forms)
         notes = [Part(path=str(path)) for path in files]
@@ -156,11 +149,11 @@ def require_plausible(recording: Recording, where: str) -> None:
 
 
 def _read_part(
-    files: list[Path], forms: list[Format], number: int, context: ReadContext
+    files: list[Path], forms: list[Format], number: int, context: builder.ReadContext
 ) -> Recording:
     """One of several inputs, of which others of its format may state what it lacks."""
     path, form = files[number], forms[number]
-    context = part_context(context, number, len(files))
+    context = builder.part_context(context, number, len(files))
     others = [file for file, of in zip(files, forms, strict=True) if of is form and file != path]
     raw = form.read([path], context, others)
     recording = interpret(raw, context.options, context.scratch)
@@ -251,11 +244,11 @@ def join_recordings(
         columns = columns_of(name)
         if columns is None:
             return None
-        builder = ArrayBuilder(columns[0].dtype, columns[0].shape[1:], scratch)
+        joined = ArrayBuilder(columns[0].dtype, columns[0].shape[1:], scratch)
         for column in columns:
             for block in arrays.iter_blocks(column):
-                builder.append(column[block])
-        return reorder_scans(builder.finish(), length, order, scratch)
+                joined.append(column[block])
+        return builder.reorder_scans(joined.finish(), length, order, scratch)
 
     posed = [part.T_recorded_base for part in parts]
     is_posed = not any(_starts_anew(*pair) for pair in pairwise(posed))
@@ -305,7 +298,7 @@ def _join_notes(
 
     def join(key: str) -> dict[str, Skipped]:
         return {
-            f"{reason} (in {Path(name).name})": replace(own, lines=own.lines[:MAX_LINE_NUMBERS])
+            f"{reason} (in {Path(name).name})": own
             for name, source in zip(names, noted, strict=True)
             for reason, own in getattr(source, key).items()
         }

@@ -104,7 +104,7 @@ def _cloud_format(
     return Format(name, endings, matches, _one(module))
 
 
-_LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz")
+LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz")
 _HEADER, _KITTI = (stillmap_folder.HEADER,), ("velodyne/", "velodyne_points/")
 FORMATS = (
     Format("stillmap recording", _HEADER, _is_stillmap_folder, _read_stillmap_folder),
@@ -116,7 +116,7 @@ FORMATS = (
     _cloud_format("E57", e57, e57.MAGIC),
     _cloud_format("LAS", las, las.MAGIC),
     _cloud_format("PLY", ply, ply.is_ply),
-    Format("CARMEN log", _LOGS, _is_carmen, load_later("carmen.reader"), joins=True),
+    Format("CARMEN log", (*LOGS, ".gz"), _is_carmen, load_later("carmen.reader"), joins=True),
 )
 
 

@@ -91,17 +91,14 @@ def _list_scenes(path: Path) -> Frames:
     for entry in path.iterdir():
         match = _FRAME.fullmatch(entry.name)
         if match:
-            by_kind[match[2]].append((_nominal_ns(int(match[1])), entry))
+            stamp_ns = (int(match[1]) * 10**9 + _RATE // 2) // _RATE
+            by_kind[match[2]].append((stamp_ns, entry))
     depth = sorted(by_kind["depth"])
     if not depth:
         raise InputError("holds no frame-NNNNNN.depth.png", where=str(path))
     warnings = [f"no file holds stamps: images are taken {_RATE} per second, by their numbers"]
     color, poses = sorted(by_kind["color"]), [_read_pose(file) for _, file in depth]
     return Frames(SCENES, depth, color, poses, _read_intrinsics(path, warnings), warnings)
-
-
-def _nominal_ns(number: int) -> int:
-    return (number * 10**9 + _RATE // 2) // _RATE
 
 
 def _read_pose(depth: Path) -> Float | None:

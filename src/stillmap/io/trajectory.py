@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stillmap.core import se2
+from stillmap.core import se2, se3
 from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
@@ -42,12 +42,10 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> Float:
     is_small = np.abs(R).max() <= 1.0 + _UNIT_TOLERANCE
     if not is_small or np.abs(R @ R.T - np.eye(3)).max() > _UNIT_TOLERANCE or np.linalg.det(R) < 0:
         raise ValueError("a pose has no rotation matrix")
-    if not np.array_equal(R @ R.T, np.eye(3)):  # an exact rotation stays bit-identical
-        U, _, Vt = np.linalg.svd(R)
-        R = U @ Vt
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
-    return T
+    # an exact rotation stays bit-identical
+    return T if np.array_equal(R @ R.T, np.eye(3)) else se3.normalize(T)
 
 
 def is_rigid(T: Float, tolerance: float = _UNIT_TOLERANCE) -> Bool:

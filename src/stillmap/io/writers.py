@@ -16,7 +16,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.point_cloud import kitti, las, pcd, ply
 from stillmap.io.point_cloud.clouds import describe_non_returns, place_clouds
-from stillmap.io.registry import load_later
+from stillmap.io.registry import LOGS, load_later
 
 # (recording, path, overwrite) -> what could not be written, a sentence each
 Write = Callable[[Recording, Path, bool], list[str]]
@@ -67,7 +67,6 @@ def _write_cloud(
     return [*losses, *describe_non_returns(recording)]
 
 
-_LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz")
 _HEADER, _ALL = stillmap_folder.HEADER, tuple(_OPTIONAL_FIELDS)
 _PLACED = _POSES + _ODOMETRY
 _LOG, _BAG = load_later("carmen.writer", "write_log"), load_later("ros.writer", "write_recording")
@@ -75,7 +74,7 @@ _PLY, _LAS = partial(_write_cloud, ply.write), partial(_write_cloud, las.write)
 WRITERS = (
     Writer("stillmap", "a recording folder", (), _HEADER, stillmap_folder.write, _ALL),
     Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", partial(_BAG, "ros2")),
-    Writer("carmen", "a CARMEN log", _LOGS, "", _LOG, _ODOMETRY, 2, 2),
+    Writer("carmen", "a CARMEN log", LOGS, "", _LOG, _ODOMETRY, 2, 2),
     Writer("bag", "a ROS 1 bag", (".bag",), "", partial(_BAG, "bag")),
     Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(_BAG, "db3")),
     Writer("mcap", "an MCAP file", (".mcap",), "", partial(_BAG, "mcap")),

@@ -9,7 +9,7 @@ from stillmap.core import arrays, se2
 from stillmap.core.array_types import Bool, Float32
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.core.source import Spin
+from stillmap.core.source import LaserPose, Spin
 from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.gravity import align_to_gravity
 from stillmap.prepare.lasers import RawLasers, mirror_beams, place_beams
@@ -107,8 +107,7 @@ def _apply_laser_options(recording: Recording, number: int, laser: LaserOptions)
     if recording.dimension != 2:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
     T = np.array(recording.T_base_sensor)
-    recorded = se2.parameters(T[number])
-    pose = (r if g is None else g for r, g in zip(recorded, laser.pose, strict=True))
-    T[number] = se2.matrix(*pose)
+    recorded = LaserPose(*se2.parameters(T[number]).tolist())
+    T[number] = recorded.override(laser.pose).matrix()
     changed = replace(recording, T_base_sensor=T)
     return mirror_beams(changed, number) if laser.upside_down else changed

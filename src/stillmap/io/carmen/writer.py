@@ -14,13 +14,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import RangeRule
 from stillmap.core.timestamps import format_seconds
 from stillmap.io import laser_scan
-from stillmap.io.carmen.log import (
-    BYTE_ORDER_MARK,
-    SCAN_KINDS,
-    first_reading,
-    flaser_config,
-    read_log,
-)
+from stillmap.io.carmen import log
 from stillmap.io.carmen.reader import is_stated_by_lines, select_scans
 from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
 from stillmap.io.text_lines import read_lines, replace_words, write_atomically
@@ -168,7 +162,7 @@ def _is_upside_down(angles: Float) -> bool:
 
 def _are_half_circles(angles: Float, counts: Int64) -> bool:
     """True if first and last beams have the directions of FLASER lines with as many readings."""
-    expected = {int(n): flaser_config(int(n))[:2] for n in np.unique(counts)}
+    expected = {int(n): log.flaser_config(int(n))[:2] for n in np.unique(counts)}
     off = angles - np.array([expected[n] for n in counts.tolist()]).reshape(-1, 2)
     off[:, 1] = off[:, 0] + (counts - 1) * off[:, 1]
     return bool(np.all(np.abs(off) < _SAME_ANGLE))
@@ -212,7 +206,7 @@ def write_filtered(job: FilterJob) -> Omissions:
         InputError: the source is not the log that was read, or the output cannot be written.
     """
     recording = job.recording
-    lasers, _ = select_scans(read_log([job.source], window=TimeWindow(job.options)))
+    lasers, _ = select_scans(log.read_log([job.source], window=TimeWindow(job.options)))
     none = np.empty(0, np.int64)
     stamp_ns = np.concatenate([none, *(own.stamp_ns for own in lasers)])
     order = np.argsort(stamp_ns, kind="stable")
@@ -231,13 +225,13 @@ def write_filtered(job: FilterJob) -> Omissions:
     with write_atomically(job.output) as file:
         for line in read_lines(job.source):
             t = scan_of.get(line.number)
-            text = line.text.removeprefix(BYTE_ORDER_MARK)
+            text = line.text.removeprefix(log.BYTE_ORDER_MARK)
             name = b"".join(text.split(maxsplit=1)[:1])
             if t is not None:
-                blank = np.flatnonzero(job.blank[recording.beams_of(t)]) + first_reading(name)
+                blank = np.flatnonzero(job.blank[recording.beams_of(t)]) + log.first_reading(name)
                 new = replace_words(text, dict.fromkeys(blank.tolist(), codes[recording.sensor[t]]))
                 file.write(line.text[: len(line.text) - len(text)] + new)
-            elif line.damage or name in SCAN_KINDS:
+            elif line.damage or name in log.SCAN_KINDS:
                 omitted += 1
             else:
                 file.write(line.text)

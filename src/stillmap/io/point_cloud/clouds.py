@@ -14,6 +14,7 @@ from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import finite_rows
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, MissingExtra
+from stillmap.core.local_frame import shift_poses
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords, explain_failure
@@ -304,9 +305,7 @@ def place_clouds(recording: Recording, poses: Float | None) -> Float | None:
         return poses
     if poses is None:
         poses = np.tile(np.eye(4), (recording.n_scans, 1, 1))
-    placed = np.array(poses)
-    placed[:, :3, 3] += origin
-    return placed
+    return shift_poses(poses, origin)
 
 
 def _find_origin(points: Float) -> Float | None:

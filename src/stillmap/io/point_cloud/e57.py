@@ -20,21 +20,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.clouds import (
-    Cloud,
-    CloudSource,
-    Origin,
-    build_recording,
-    files_of,
-    library_errors,
-)
-from stillmap.io.point_cloud.table import (
-    Columns,
-    gather_points,
-    open_table,
-    require_all,
-    truncated_error,
-)
+from stillmap.io.point_cloud import clouds, table
 from stillmap.io.trajectory import pose_from_quaternion
 
 EXTENSIONS, MAGIC = (".e57",), b"ASTM-E57"
@@ -57,16 +43,16 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no scan can be read, or pye57 is missing.
     """
     import_extra("pye57.libe57", path)
-    origin, sources, damaged = Origin(), [], Counter[Path]()
-    for file in files_of(path, EXTENSIONS):
+    origin, sources, damaged = clouds.Origin(), [], Counter[Path]()
+    for file in clouds.files_of(path, EXTENSIONS):
         count = _count_scans(file, single=path.is_file())
         for scan in range(count):
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
             read_cloud = partial(_read_cloud, file, scan, origin, context.scratch, damaged)
-            sources.append(CloudSource(name, read_cloud))
+            sources.append(clouds.CloudSource(name, read_cloud))
     single = path.is_file() and len(sources) == 1
     notes = Source(str(path), format="E57")
-    recording = build_recording(sources, notes, context, single=single)
+    recording = clouds.build_recording(sources, notes, context, single=single)
     origin.add_notes(recording)
     return recording
 
@@ -92,7 +78,7 @@ def _open_e57(path: Path) -> Iterator[tuple[Any, Any]]:
     """The library and an open file; errors of the library become InputError."""
     library = import_extra("pye57.libe57", path)
     _check_xml(path)
-    with library_errors(path), closing(library.ImageFile(str(path), "r")) as file:
+    with clouds.library_errors(path), closing(library.ImageFile(str(path), "r")) as file:
         yield library, file
 
 
@@ -100,7 +86,7 @@ def _check_xml(path: Path) -> None:
     """Refuse XML sections with entities (which expand without limit), schemas elsewhere, deep
     nesting or huge size: libe57 trusts them.
     """
-    with open_table(path) as file:
+    with table.open_table(path) as file:
         head = file.read(48)
         start, length = (int.from_bytes(head[at : at + 8], "little") for at in (24, 32))
         if len(head) < 48 or head[:8] != MAGIC or not str(path).isprintable():
@@ -149,8 +135,8 @@ def _parse_xml(text: bytes) -> None:
 
 
 def _read_cloud(
-    path: Path, scan: int, origin: Origin, scratch: Path | None, damaged: Counter[Path]
-) -> Cloud:
+    path: Path, scan: int, origin: clouds.Origin, scratch: Path | None, damaged: Counter[Path]
+) -> clouds.Cloud:
     """Read one scan of a file, up to too many damaged ones."""
     if damaged[path] >= _MAX_DAMAGED:
         raise InputError("holds too many damaged scans", where=str(path))
@@ -159,18 +145,18 @@ def _read_cloud(
         node = file.root()["data3D"][scan]
         T = _read_pose(node)
         if T is not None and not np.array_equal(T, np.eye(4)):
-            origin = Origin(np.zeros(3))
+            origin = clouds.Origin(np.zeros(3))
         rows = node["points"].childCount()
         if rows > 8 * path.stat().st_size:
-            raise truncated_error(path)  # less than one bit per point
-        blocks = require_all(_iter_blocks(library, file, node, path), rows, path)
-        points, _ = gather_points(blocks, origin.shift, scratch)
+            raise table.truncated_error(path)  # less than one bit per point
+        blocks = table.require_all(_iter_blocks(library, file, node, path), rows, path)
+        points, _ = table.gather_points(blocks, origin.shift, scratch)
         stamp_ns = _read_stamp(node)
     damaged[path] -= 1
-    return Cloud(points, T, stamp_ns=stamp_ns)
+    return clouds.Cloud(points, T, stamp_ns=stamp_ns)
 
 
-def _iter_blocks(library: Any, file: Any, node: Any, path: Path) -> Iterator[Columns]:
+def _iter_blocks(library: Any, file: Any, node: Any, path: Path) -> Iterator[table.Columns]:
     """Yield x, y, z (k,) in metres, NaN for points marked as invalid.
 
     Raises:

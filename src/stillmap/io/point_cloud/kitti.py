@@ -21,14 +21,6 @@ from stillmap.core.timestamps import format_seconds
 from stillmap.io import cameras
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
-from stillmap.io.point_cloud.clouds import (
-    Cloud,
-    CloudSource,
-    describe_non_returns,
-    scan_hits,
-    sensor_poses,
-)
-from stillmap.io.point_cloud.table import TableLayout, parse_numbers
 from stillmap.io.text_lines import assign_rows, list_files, read_times, stamp_files
 from stillmap.io.trajectory import pose_from_row, rigid_transform
 
@@ -107,14 +99,14 @@ def read(path: Path, context: ReadContext) -> Recording:
         read_cloud = partial(_read_scan, file, None if index is None else poses.get(index))
         if stamp_ns is None:
             read_cloud = partial(clouds.reject, file, "has no stamp")
-        sources.append(CloudSource(file.name, read_cloud, stamp_ns))
+        sources.append(clouds.CloudSource(file.name, read_cloud, stamp_ns))
     notes = Source(str(path), format="KITTI", warnings=warnings, stamp_azimuth=0.0)
     if scans == _RAW:
         notes.spin_direction = "clockwise"
     return clouds.build_recording(sources, notes, context, images=pictures)
 
 
-def scan_layout(path: Path) -> TableLayout:
+def scan_layout(path: Path) -> table.TableLayout:
     """The layout of the points of a scan.
 
     Raises:
@@ -123,12 +115,12 @@ def scan_layout(path: Path) -> TableLayout:
     with table.open_table(path) as file:
         if file.size % _POINT.itemsize:
             raise table.truncated_error(path)
-        return TableLayout(path, _POINT, file.size // _POINT.itemsize)
+        return table.TableLayout(path, _POINT, file.size // _POINT.itemsize)
 
 
-def _read_scan(path: Path, T: Float | None) -> Cloud:
+def _read_scan(path: Path, T: Float | None) -> clouds.Cloud:
     points, _ = table.gather_points(table.read_columns(scan_layout(path), "xyz"), np.asarray)
-    return Cloud(points, T)
+    return clouds.Cloud(points, T)
 
 
 def _read_poses(
@@ -171,7 +163,7 @@ def _read_pose_file(folder: Path, calibration: Calibration) -> tuple[list[Float]
 
 
 def _read_rows(path: Path) -> list[Float]:
-    numbers = parse_numbers(table.iter_text_lines(path), 10_000_000, range(12), path)
+    numbers = table.parse_numbers(table.iter_text_lines(path), 10_000_000, range(12), path)
     try:
         return [pose_from_row(row) for row in numbers]
     except ValueError as error:
@@ -188,7 +180,7 @@ def _read_oxts(folder: Path) -> list[Float]:
     out: list[Float] = []
     scale = first = None
     for path in list_files(folder, (".txt",)):
-        numbers = parse_numbers(table.iter_text_lines(path), 1, range(6), path)
+        numbers = table.parse_numbers(table.iter_text_lines(path), 1, range(6), path)
         if not len(numbers):
             raise InputError("is empty", where=str(path))
         latitude, longitude, height, *angles = numbers[0]
@@ -317,24 +309,23 @@ def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str
         InputError: `path` is taken or cannot be written.
     """
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
-    T = sensor_poses(recording, T)
+    T = clouds.sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))
     with atomic_folder(path, MARKER, overwrite) as folder:
         (folder / "velodyne").mkdir()
         for scan in recording.iter_scans(range(recording.n_scans)):
-            points, _ = scan_hits(recording, scan)
+            points, _ = clouds.scan_hits(recording, scan)
             rows = np.zeros((len(points), 4), "<f4")
             rows[:, :3] = points
             (folder / "velodyne" / f"{scan:0{digits}d}.bin").write_bytes(rows.data)
         stamps = (f"{format_seconds(stamp)}\n" for stamp in recording.stamp_ns.tolist())
         (folder / "times.txt").write_text("".join(stamps), encoding="ascii")
-        identity = " ".join(f"{value:g}" for value in np.eye(4)[:3].ravel())
-        (folder / "calib.txt").write_text(f"Tr: {identity}\n", encoding="ascii")
+        (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n", encoding="ascii")
         if T is not None:
             lines = (" ".join(f"{v:.17g}" for v in pose[:3].ravel()) for pose in T)
             text = "".join(f"{row}\n" for row in lines)
             (folder / "poses.txt").write_text(text, encoding="ascii")
-    losses = describe_non_returns(recording)
+    losses = clouds.describe_non_returns(recording)
     if recording.T_odom_base is None:
         return losses
     if recording.T_recorded_base is None:

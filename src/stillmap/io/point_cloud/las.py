@@ -17,13 +17,7 @@ from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.clouds import (
-    Cloud,
-    Origin,
-    iter_map_points,
-    library_errors,
-    read_clouds,
-)
+from stillmap.io.point_cloud import clouds
 from stillmap.io.point_cloud.table import gather_points, open_table, require_all, truncated_error
 
 EXTENSIONS, MAGIC = (".las", ".laz"), b"LASF"
@@ -47,15 +41,15 @@ def read(path: Path, context: ReadContext) -> Recording:
     """
     import_extra("laspy", path)
     notes = Source(str(path), format="LAS")
-    return read_clouds(notes, EXTENSIONS, _read_cloud, context)
+    return clouds.read_clouds(notes, EXTENSIONS, _read_cloud, context)
 
 
-def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
+def _read_cloud(path: Path, origin: clouds.Origin, scratch: Path | None) -> clouds.Cloud:
     with open_las_reader(path) as reader:
         columns = ([block.x, block.y, block.z] for block in iter_blocks(reader, path))
         blocks = require_all(columns, reader.header.point_count, path)
         points, _ = gather_points(blocks, origin.shift, scratch)
-    return Cloud(points)
+    return clouds.Cloud(points)
 
 
 @contextmanager
@@ -71,7 +65,7 @@ def open_las_reader(path: Path) -> Iterator[Any]:
         # single-threaded: the parallel backend trusts chunk sizes
         backend = laspy.LazBackend.Lazrs
         file.seek(0)
-        with library_errors(path):
+        with clouds.library_errors(path):
             reader = laspy.open(file, closefd=False, read_evlrs=False, laz_backend=backend)
         with closing(reader):
             if table is not None:
@@ -92,7 +86,7 @@ def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
     ):
         raise truncated_error(path)
     rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
-    with library_errors(path):
+    with clouds.library_errors(path):
         for block in reader.chunk_iterator(rows):
             if len(block) > rows:
                 raise InputError("is damaged: the size of its points", where=str(path))
@@ -132,7 +126,7 @@ def _check_layers(file: InputFile, header: Any, table: int, path: Path) -> None:
     Raises:
         InputError: they are longer or shorter.
     """
-    with library_errors(path):
+    with clouds.library_errors(path):
         record = header.vlrs.get("LasZipVlr")[0].record_data
         compressor, n_items = struct.unpack_from("<H30xH", record)
         if compressor != _LAYERED:
@@ -172,7 +166,7 @@ def write(recording: Recording, path: Path, poses: Float) -> None:
     laspy = import_extra("laspy", path, "written")
     header, compressed = _make_header(laspy, poses), path.name.lower().endswith(".laz")
     with atomic_file(path) as work, open_las_writer(work, laspy, header, compressed) as writer:
-        for points in iter_map_points(recording, poses):
+        for points in clouds.iter_map_points(recording, poses):
             block = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
             block.x, block.y, block.z = points.T
             writer.write_points(block)

@@ -18,14 +18,6 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import clouds, table
-from stillmap.io.point_cloud.clouds import (
-    Cloud,
-    Origin,
-    describe_non_returns,
-    scan_hits,
-    sensor_poses,
-)
-from stillmap.io.point_cloud.table import TableLayout
 from stillmap.io.trajectory import pose_from_quaternion, quaternion_from_pose
 
 EXTENSIONS = (".pcd",)
@@ -39,7 +31,7 @@ _TYPES = {  # by TYPE and SIZE
 _MIN_VIEWPOINT_DISTANCE = 5.0  # m from the origin, to detect the frame of the points
 
 
-Header = tuple[TableLayout, Float | None]
+Header = tuple[table.TableLayout, Float | None]
 
 
 def is_pcd(head: bytes) -> bool:
@@ -85,7 +77,9 @@ def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: 
         raise ValueError(f"{rows} points, DATA {kind[:20]}")
     is_text, is_compressed = kind == "ascii", kind == "binary_compressed"
     ordered = height != "1"
-    layout = TableLayout(path, dtype, rows, start, start, lines, is_text, is_compressed, ordered)
+    layout = table.TableLayout(
+        path, dtype, rows, start, start, lines, is_text, is_compressed, ordered
+    )
     return layout, _parse_viewpoint(entries.get("VIEWPOINT"))
 
 
@@ -118,8 +112,8 @@ def read(path: Path, context: ReadContext) -> Recording:
 
 
 def _read_cloud(
-    path: Path, origin: Origin, scratch: Path | None = None, *, in_map_frame: bool = False
-) -> Cloud:
+    path: Path, origin: clouds.Origin, scratch: Path | None = None, *, in_map_frame: bool = False
+) -> clouds.Cloud:
     layout, T = read_header(path)
     T_sensor_map = np.eye(4) if T is None or not in_map_frame else se2.inverse(T)
     time = table.find_time_column(layout.dtype.names or ())
@@ -133,7 +127,7 @@ def _read_cloud(
         return points.astype(np.float64) @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3]
 
     points, times = table.gather_points(table.read_columns(layout, names), to_sensor, scratch)
-    return Cloud(points, T, times[0] if times else None)
+    return clouds.Cloud(points, T, times[0] if times else None)
 
 
 def _detect_map_frame(files: list[Path]) -> bool:
@@ -150,7 +144,7 @@ def _detect_map_frame(files: list[Path]) -> bool:
                 farthest, at = file, float(np.linalg.norm(T[:3, 3]))
     with suppress(InputError, OSError, MemoryError):
         if farthest is not None:
-            points, T, *_ = _read_cloud(farthest, Origin())
+            points, T, *_ = _read_cloud(farthest, clouds.Origin())
             points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
             if T is not None and len(points):
                 from_origin = np.median(np.linalg.norm(points, axis=1))
@@ -169,7 +163,7 @@ def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str
     Raises:
         InputError: `path` is taken or cannot be written.
     """
-    T = sensor_poses(recording, recording.T_recorded_base)
+    T = clouds.sensor_poses(recording, recording.T_recorded_base)
     with atomic_folder(path, MARKER, overwrite) as folder:
         repeats = 0
         for scan in recording.iter_scans(range(recording.n_scans)):
@@ -179,11 +173,11 @@ def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str
             name = f"{stamp:0{20 if stamp < 0 else 19}d}" + (f"_{repeats}" if repeats else "")
             pose = np.eye(4) if T is None else T[scan]
             (folder / f"{name}.pcd").write_bytes(_encode_scan(recording, scan, pose))
-    return describe_non_returns(recording)
+    return clouds.describe_non_returns(recording)
 
 
 def _encode_scan(recording: Recording, scan: int, T: Float) -> bytes:
-    points, times = scan_hits(recording, scan)
+    points, times = clouds.scan_hits(recording, scan)
     rows = points if times is None else np.column_stack([points, times])
     names = ["x", "y", "z", "time"][: rows.shape[1]]
     viewpoint = " ".join(f"{value:.17g}" for value in (*T[:3, 3], *quaternion_from_pose(T)))

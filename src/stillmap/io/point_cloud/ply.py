@@ -10,15 +10,7 @@ from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.clouds import Cloud, Origin, iter_map_points, read_clouds
-from stillmap.io.point_cloud.table import (
-    TableLayout,
-    gather_points,
-    open_table,
-    read_columns,
-    record_type,
-    split_header,
-)
+from stillmap.io.point_cloud import clouds, table
 
 EXTENSIONS = (".ply",)
 
@@ -43,24 +35,24 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no cloud can be read.
     """
     notes = Source(str(path), format="PLY")
-    return read_clouds(notes, EXTENSIONS, _read_cloud, context)
+    return clouds.read_clouds(notes, EXTENSIONS, _read_cloud, context)
 
 
-def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
-    blocks = read_columns(read_layout(path), ("x", "y", "z"))
-    points, _ = gather_points(blocks, origin.shift, scratch)
-    return Cloud(points)
+def _read_cloud(path: Path, origin: clouds.Origin, scratch: Path | None) -> clouds.Cloud:
+    blocks = table.read_columns(read_layout(path), ("x", "y", "z"))
+    points, _ = table.gather_points(blocks, origin.shift, scratch)
+    return clouds.Cloud(points)
 
 
-def read_layout(path: Path) -> TableLayout:
+def read_layout(path: Path) -> table.TableLayout:
     """Read the header: the layout of the vertices, ordered where others may refer to them.
 
     Raises:
         InputError: it is no PLY file, or its vertices cannot be located.
     """
-    with open_table(path) as file:
+    with table.open_table(path) as file:
         head = file.read(_MAX_HEADER)
-    lines, start = split_header(path, head, lambda words: words == ["end_header"])
+    lines, start = table.split_header(path, head, lambda words: words == ["end_header"])
     if lines[0] != ["ply"]:
         raise InputError("is no PLY file", where=str(path))
     try:
@@ -69,7 +61,7 @@ def read_layout(path: Path) -> TableLayout:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
-def _parse_header(path: Path, lines: list[list[str]], header: int) -> TableLayout:
+def _parse_header(path: Path, lines: list[list[str]], header: int) -> table.TableLayout:
     encoding, order = "", ""
     elements: list[tuple[str, int, list[tuple[str, str, int]]]] = []
     with_lists: set[str] = set()
@@ -90,11 +82,10 @@ def _parse_header(path: Path, lines: list[list[str]], header: int) -> TableLayou
         if name in with_lists and (name == "vertex" or not text):
             raise ValueError("its vertices have list properties, or follow such")
         if name == "vertex":
-            indexed, dtype = (
-                any(n > 0 for one, n, _ in elements if one != name),
-                record_type(columns),
-            )
-            return TableLayout(path, dtype, rows, header, start, before, text, ordered=indexed)
+            ordered = any(n > 0 for one, n, _ in elements if one != name)
+            dtype = table.record_type(columns)
+            at = header, start, before
+            return table.TableLayout(path, dtype, rows, *at, text, ordered=ordered)
         start += rows * sum(np.dtype(kind).itemsize for _, kind, _ in columns)
         before += rows
     raise ValueError("no vertices")
@@ -116,5 +107,5 @@ def write(recording: Recording, path: Path, poses: Float) -> None:
         names = "".join(f"property double {name}\n" for name in "xyz")
         head = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{names}end_header\n"
         file.write(head.encode())
-        for points in iter_map_points(recording, poses):
+        for points in clouds.iter_map_points(recording, poses):
             file.write(points.astype("<f8").tobytes())

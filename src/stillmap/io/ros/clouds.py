@@ -16,18 +16,9 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes, Source
 from stillmap.io.builder import RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.clouds import Cloud
-from stillmap.io.point_cloud.table import (
-    convert_times,
-    detect_clock,
-    find_time_column,
-)
+from stillmap.io.point_cloud.table import convert_times, detect_clock, find_time_column
 from stillmap.io.ros import tf
-from stillmap.io.ros.messages import (
-    Message,
-    SkippedByTopic,
-    frame_name,
-    stamp_ns,
-)
+from stillmap.io.ros.messages import Message, SkippedByTopic, frame_name, stamp_ns
 from stillmap.prepare.options import ReadOptions
 
 NO_COORDINATES = "cloud without x, y and z"

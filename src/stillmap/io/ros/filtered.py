@@ -10,20 +10,10 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
 from stillmap.io.filtered_clouds import FilterJob, Omissions, other_recording_error
 from stillmap.io.point_cloud.table import erase_coordinates
+from stillmap.io.ros import messages
 from stillmap.io.ros.bag import Bag, read_bag
 from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.limits import count_output
-from stillmap.io.ros.messages import (
-    MULTI_ECHO,
-    POINT_CLOUD,
-    SCAN_TYPES,
-    BagKind,
-    Message,
-    decode,
-    decompress,
-    detect_kind,
-    frame_name,
-)
 from stillmap.io.ros.writer import new_bag
 
 _PROGRESS_INTERVAL = 200  # messages
@@ -44,8 +34,8 @@ def write_filtered(job: FilterJob) -> Omissions:
 
 
 def _copy(bag: Bag, job: FilterJob) -> Omissions:
-    kind, mcap = detect_kind(job.source)
-    kind = cast(BagKind, job.kind) if job.kind else kind
+    kind, mcap = messages.detect_kind(job.source)
+    kind = cast(messages.BagKind, job.kind) if job.kind else kind
     topics, scan_of = _number_scans(job)
     count, omitted, damaged = dict.fromkeys(topics, 0), 0, 0
     total = max(sum(c.n_messages for c in bag.channels), 1)
@@ -73,7 +63,7 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
         if scan_of:
             raise other_recording_error(job.source)
     unknown = {c.topic for c in bag.channels if sends[c.id] is None and c.n_messages}
-    unfiltered = {c.topic for c in bag.channels if c.type in SCAN_TYPES} - topics - unknown
+    unfiltered = {c.topic for c in bag.channels if c.type in messages.SCAN_TYPES} - topics - unknown
     why = "left out: the bag does not say what its messages are made of"
     notes = [f"{topic} is as it was: it was not mapped" for topic in sorted(unfiltered)]
     notes += [f"{topic} {why}" for topic in sorted(unknown)]
@@ -81,10 +71,10 @@ def _copy(bag: Bag, job: FilterJob) -> Omissions:
     return Omissions(omitted, tuple(notes))
 
 
-def _unpack(message: Message) -> bytes | None:
+def _unpack(message: messages.Message) -> bytes | None:
     """The content of a message; None: it is damaged."""
     try:
-        raw = decompress(message)
+        raw = messages.decompress(message)
     except InputError:
         raise
     except Exception:  # any error of the library about damaged data
@@ -104,16 +94,16 @@ def _number_scans(job: FilterJob) -> tuple[set[str], dict[tuple[str, int], int]]
     return set(topic), {key: scan for scan, key in enumerate(keys)}
 
 
-def _blank(message: Message, mask: Bool, job: FilterJob) -> Any:
+def _blank(message: messages.Message, mask: Bool, job: FilterJob) -> Any:
     """The content of a message without the readings or points `mask` (n,)."""
-    content, topic = decode(message), message.channel.topic
-    if message.channel.type == POINT_CLOUD:
+    content, topic = messages.decode(message), message.channel.topic
+    if message.channel.type == messages.POINT_CLOUD:
         _blank_points(content, mask, topic)
         return content
-    key = topic, frame_name(content.header.frame_id)
+    key = topic, messages.frame_name(content.header.frame_id)
     rule = next(s.ranges for s in job.recording.source.sensors if (s.name, s.frame) == key)
     code = np.float32(0.0 if rule and rule.zero_means == "max-range" else math.inf)
-    if message.channel.type == MULTI_ECHO:
+    if message.channel.type == messages.MULTI_ECHO:
         for k in np.flatnonzero(mask):
             content.ranges[k].echoes = np.array([code])
     else:

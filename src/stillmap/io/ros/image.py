@@ -14,15 +14,8 @@ from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io.cameras import open_image, order_images, to_array
+from stillmap.io.ros import messages
 from stillmap.io.ros.bag import Bag
-from stillmap.io.ros.messages import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    Message,
-    decode,
-    frame_name,
-    stamp_ns,
-)
 from stillmap.io.ros.tf import TransformTree
 from stillmap.io.trajectory import rigid_transform
 
@@ -53,15 +46,14 @@ class ImageCollector:
         self._infos: dict[str, Any] = {}  # CameraInfo by topic
         self._frames: dict[str, str] = {}
 
-    def add_message(self, message: Message, content: Any) -> None:
+    def add_message(self, message: messages.Message, content: Any) -> None:
         """Add a message, and what was decoded of it."""
         topic = message.channel.topic
-        stamp, frame = stamp_ns(content.header), frame_name(content.header.frame_id)
-        if message.channel.type == CAMERA_INFO:
+        if message.channel.type == messages.CAMERA_INFO:
             self._infos.setdefault(topic, content)
             return
-        self._headers.append((stamp, message.log_ns, topic))
-        self._frames.setdefault(topic, frame)
+        self._headers.append((messages.stamp_ns(content.header), message.log_ns, topic))
+        self._frames.setdefault(topic, messages.frame_name(content.header.frame_id))
 
     def build_images(
         self, tree: TransformTree, base: str, reopen: Callable[[], Bag]
@@ -130,9 +122,9 @@ def _select_topics(topics: list[str]) -> list[str]:
 def _load_image(bag: Bag, stamp: int, log_ns: int, topic: str) -> NDArray[Any]:
     try:
         for message in bag.messages({topic}, log_ns):
-            content = decode(message)
-            if stamp_ns(content.header) == stamp:
-                return decode_pixels(content, message.channel.type == COMPRESSED_IMAGE)
+            content = messages.decode(message)
+            if messages.stamp_ns(content.header) == stamp:
+                return decode_pixels(content, message.channel.type == messages.COMPRESSED_IMAGE)
     except InputError:
         raise
     except Exception as error:  # any error of a library about damaged bytes

@@ -19,13 +19,7 @@ from stillmap.core.errors import InputError, advise
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros import tf
-from stillmap.io.ros.messages import (
-    MULTI_ECHO,
-    Message,
-    SkippedByTopic,
-    frame_name,
-    stamp_ns,
-)
+from stillmap.io.ros.messages import MULTI_ECHO, Message, SkippedByTopic, frame_name, stamp_ns
 from stillmap.prepare.lasers import Beams, RawLaser, RawLasers, scan_order, unit_vectors
 from stillmap.prepare.options import ReadOptions
 

@@ -10,29 +10,12 @@ from stillmap.core.camera import Images
 from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext, SkippedRecords
+from stillmap.io.ros import messages
 from stillmap.io.ros.bag import Bag, read_bag
 from stillmap.io.ros.clouds import CloudCollector, read_clouds
 from stillmap.io.ros.image import ImageCollector
 from stillmap.io.ros.lasers import LaserCollector, read_lasers
 from stillmap.io.ros.limits import count_output
-from stillmap.io.ros.messages import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    ODOMETRY,
-    POINT_CLOUD,
-    ROS1_TF,
-    SCAN_TYPES,
-    TF,
-    UNREADABLE,
-    Channel,
-    DamagedBagError,
-    Message,
-    SkippedByTopic,
-    decode,
-    find_fault,
-    stamp_ns,
-)
 from stillmap.io.ros.tf import Odometry, TransformTree
 from stillmap.prepare.lasers import RawLasers
 from stillmap.prepare.options import ReadOptions
@@ -88,7 +71,7 @@ def _read_content(
         _lend_transforms(tree, others, context.scratch)
     tree.odometry = {name: own for name, own in content.odometry.items() if len(own.stamp_ns)}
     recording: Recording | RawLasers
-    if any(c.type == POINT_CLOUD and uses.get(c.topic) == "scans" for c in bag.channels):
+    if any(c.type == messages.POINT_CLOUD and uses.get(c.topic) == "scans" for c in bag.channels):
 
         def find_images(base: str) -> Images | None:
             return window.select_images(content.images.build_images(tree, base, bag.reopen))
@@ -114,10 +97,10 @@ def _lend_transforms(tree: TransformTree, others: Sequence[Path], scratch: Path 
             with closing(Bag([path], scratch, trusted=True)) as bag:
                 for message in bag.messages(_static_topics(bag)):
                     with suppress(Exception):  # any error of rosbags about damaged bytes
-                        tree.add_message(decode(message), static=True)
+                        tree.add_message(messages.decode(message), static=True)
                 if _static_topics(bag):
                     return
-        except (DamagedBagError, InputError, OSError):
+        except (messages.DamagedBagError, InputError, OSError):
             continue  # it is reported when it is read itself
 
 
@@ -131,19 +114,19 @@ def select_topics(bag: Bag, options: ReadOptions) -> tuple[dict[str, str], list[
     Raises:
         InputError: no topic has scans, or a topic that the options name has none.
     """
-    faults = {c.id: fault for c in bag.channels if (fault := find_fault(c))}
+    faults = {c.id: fault for c in bag.channels if (fault := messages.find_fault(c))}
     faults |= {c.id: "is empty" for c in bag.channels if not c.n_messages}
-    of_scans = [c for c in bag.channels if c.type in SCAN_TYPES]
+    of_scans = [c for c in bag.channels if c.type in messages.SCAN_TYPES]
     tilting = {f"{slash}{options.tilting_topic}" for slash in ("", "/")}
     scans = _find_named(bag, faults, options) or [c for c in of_scans if c.id not in faults]
     scans = [c for c in scans if c.topic not in tilting]
     if not scans:
         named = [f": {c.topic} {faults[c.id]}" for c in of_scans if c.id in faults]
         raise InputError("holds no scans" + "".join(named[:1]), hint=_list_topics(bag.channels))
-    lasers = [c for c in scans if c.type != POINT_CLOUD]
-    further = {"odometry": (ODOMETRY,), "transforms": (TF, ROS1_TF)}
+    lasers = [c for c in scans if c.type != messages.POINT_CLOUD]
+    further = {"odometry": (messages.ODOMETRY,), "transforms": (messages.TF, messages.ROS1_TF)}
     if not lasers:
-        further["images"] = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
+        further["images"] = (messages.IMAGE, messages.COMPRESSED_IMAGE, messages.CAMERA_INFO)
     usable = [c for c in bag.channels if c.id not in faults]
     uses = {c.topic: use for use, types in further.items() for c in usable if c.type in types}
     uses |= dict.fromkeys((c.topic for c in lasers or scans), "scans")
@@ -155,7 +138,7 @@ def select_topics(bag: Bag, options: ReadOptions) -> tuple[dict[str, str], list[
             why = "empty"
         elif use is not None:
             why = f"read for {use}"
-        elif c.type not in (*SCAN_TYPES, ODOMETRY, TF, ROS1_TF):
+        elif c.type not in (*messages.SCAN_TYPES, messages.ODOMETRY, messages.TF, messages.ROS1_TF):
             why = "not used"
         elif c.topic in tilting:
             why = "not for the map: its laser tilts"
@@ -164,25 +147,25 @@ def select_topics(bag: Bag, options: ReadOptions) -> tuple[dict[str, str], list[
     return uses, notes
 
 
-def _find_named(bag: Bag, faults: dict[int, str], options: ReadOptions) -> list[Channel]:
+def _find_named(bag: Bag, faults: dict[int, str], options: ReadOptions) -> list[messages.Channel]:
     """The channels of the topics that the options name."""
     named = []
     for name in options.topic.split(",") if options.topic is not None else ():
         own = [c for c in bag.channels if c.topic in (name.strip(), f"/{name.strip()}")]
-        scans = [c for c in own if c.type in SCAN_TYPES and c.id not in faults]
+        scans = [c for c in own if c.type in messages.SCAN_TYPES and c.id not in faults]
         if not scans:
             why = [faults.get(c.id, f"has {c.type}, no scans") for c in own] or ["is not there"]
             raise InputError(f"topic {name.strip()!r} {why[0]}", hint=_list_topics(bag.channels))
         named += scans
-    if len({c.type == POINT_CLOUD for c in named}) > 1:
+    if len({c.type == messages.POINT_CLOUD for c in named}) > 1:
         raise InputError("laser scans and point clouds cannot be used together", hint="name either")
     return named
 
 
-def _list_topics(channels: list[Channel]) -> str:
+def _list_topics(channels: list[messages.Channel]) -> str:
     if not channels:
         return "it has no topics"
-    of_scans = [c for c in channels if c.type in SCAN_TYPES and c.n_messages]
+    of_scans = [c for c in channels if c.type in messages.SCAN_TYPES and c.n_messages]
     shown = [f"{c.topic} ({c.type.rpartition('/')[2]})" for c in (of_scans or channels)[:12]]
     return f"{'topics with scans:' if of_scans else 'it has'} {', '.join(shown)}"
 
@@ -193,43 +176,43 @@ class BagContent:
     def __init__(self, uses: dict[str, str], context: ReadContext) -> None:
         self._uses, self._count = uses, Counter[str]()  # scans by topic
         self.window = TimeWindow(context.options)
-        self.skipped = SkippedByTopic(SkippedRecords)
+        self.skipped = messages.SkippedByTopic(SkippedRecords)
         self.lasers = LaserCollector(context.scratch, self.skipped)
         self.clouds = CloudCollector(context.scratch, self.skipped)
         self.images, self.transforms = ImageCollector(), TransformTree()
         self.odometry: dict[str, Odometry] = {}
         self.unreadable = SkippedRecords()
 
-    def add(self, message: Message, number: int) -> None:
+    def add(self, message: messages.Message, number: int) -> None:
         """Add a message; scans and images outside the time window are left out."""
         topic, fault = message.channel.topic, None
         use = self._uses.get(topic)
         self._count[topic] += use == "scans"
         try:
-            content = decode(message)
+            content = messages.decode(message)
             if self._is_inside_window(message, content, use):
                 fault = self._collect(message, content, use)
         except OSError:  # the disk is full
             raise
         except Exception:  # any error of rosbags about damaged bytes
-            fault = UNREADABLE
+            fault = messages.UNREADABLE
         if fault is not None and use == "scans":
             self.skipped[topic].add(fault, self._count[topic])
         elif fault is not None:
             self.unreadable.add(f"{fault} ({topic})", number)
 
-    def _is_inside_window(self, message: Message, content: Any, use: str | None) -> bool:
+    def _is_inside_window(self, message: messages.Message, content: Any, use: str | None) -> bool:
         # one CameraInfo holds for all images
-        if use not in ("scans", "images") or message.channel.type == CAMERA_INFO:
+        if use not in ("scans", "images") or message.channel.type == messages.CAMERA_INFO:
             return True
         select = self.window.select if use == "scans" else self.window.contains
-        return select(stamp_ns(content.header) or message.log_ns)
+        return select(messages.stamp_ns(content.header) or message.log_ns)
 
-    def _collect(self, message: Message, content: Any, use: str | None) -> str | None:
+    def _collect(self, message: messages.Message, content: Any, use: str | None) -> str | None:
         """Add a message to those of its use; returns the reason if it cannot be used."""
         topic = message.channel.topic
         if use == "scans":
-            scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
+            scans = self.clouds if message.channel.type == messages.POINT_CLOUD else self.lasers
             return scans.add(message, content, self._count[topic])
         if use == "images":
             self.images.add_message(message, content)
@@ -238,7 +221,7 @@ class BagContent:
         elif use == "odometry":
             self.odometry.setdefault(topic, Odometry(topic)).add_message(content)
         else:  # of a damaged bag whose connections have the number of others
-            return UNREADABLE
+            return messages.UNREADABLE
         return None
 
 

@@ -327,9 +327,11 @@ def _find_base_frame(
 def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
     """2D poses (N, 3, 3) of a laser, whether it is mounted upside down, whether it is tilted."""
     up = T[:, 2, 2]
-    theta = np.arctan2(T[:, 1, 0], T[:, 0, 0])
-    flat = se2.matrix(T[:, 0, 3], T[:, 1, 3], theta)
-    return flat, bool(np.median(up) < 0.0), bool(np.any(np.abs(up) < _MIN_UPRIGHT))
+    return (
+        se2.project_to_plane(T),
+        bool(np.median(up) < 0.0),
+        bool(np.any(np.abs(up) < _MIN_UPRIGHT)),
+    )
 
 
 def find_odometry(

@@ -16,6 +16,7 @@ from stillmap.core import files
 from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.io.ros import messages
 from stillmap.io.ros.message_fields import (
     BASE,
     ODOM,
@@ -24,16 +25,6 @@ from stillmap.io.ros.message_fields import (
     make_cloud,
     make_odometry,
     make_transforms,
-)
-from stillmap.io.ros.messages import (
-    LASER_SCAN,
-    ODOMETRY,
-    POINT_CLOUD,
-    TF,
-    BagKind,
-    Channel,
-    hash_definition,
-    load_typestore,
 )
 
 Send = Callable[[int, Fields], None]  # stamp in ns, message
@@ -63,10 +54,10 @@ _TRANSIENT_LOCAL = interfaces.Qos(
 class BagWriter:
     """An open bag of a kind, written through an open writer of rosbags."""
 
-    def __init__(self, kind: BagKind, writer: rosbag1.Writer | rosbag2.Writer) -> None:
+    def __init__(self, kind: messages.BagKind, writer: rosbag1.Writer | rosbag2.Writer) -> None:
         self.is_ros1 = kind == "bag"
         self._writer = writer
-        self._store = store = load_typestore("ros1" if self.is_ros1 else "cdr")
+        self._store = store = messages.load_typestore("ros1" if self.is_ros1 else "cdr")
         self._serialize = store.serialize_ros1 if self.is_ros1 else store.serialize_cdr
 
     def add_topic(self, name: str, type: str, *, latched: bool = False) -> Send:
@@ -82,13 +73,13 @@ class BagWriter:
 
         return send
 
-    def copy_topic(self, channel: Channel) -> SendRaw | None:
+    def copy_topic(self, channel: messages.Channel) -> SendRaw | None:
         """Add a topic like one of another bag; returns a function that writes raw messages.
 
         None where the definition of its type is not known.
         """
         options: dict[str, Any] = {"typestore": self._store}
-        digest = channel.digest or hash_definition(channel)
+        digest = channel.digest or messages.hash_definition(channel)
         if channel.definition and digest:
             hash_name = "md5sum" if self.is_ros1 else "rihs01"
             options = {"msgdef": channel.definition, hash_name: digest}
@@ -135,7 +126,7 @@ def _make_field(store: Typestore, kind: Any, given: Any) -> Any:
 
 @contextmanager
 def new_bag(
-    path: Path, kind: BagKind, *, overwrite: bool = False, mcap: bool = False
+    path: Path, kind: messages.BagKind, *, overwrite: bool = False, mcap: bool = False
 ) -> Iterator[BagWriter]:
     """Write a bag, which lies at `path` once the block ends without an exception.
 
@@ -168,7 +159,7 @@ def new_bag(
             shutil.move(made if kind == "bag" else made / f"{name}.{kind}", work)
 
 
-def _open_writer(path: Path, kind: BagKind, mcap: bool) -> rosbag1.Writer | rosbag2.Writer:
+def _open_writer(path: Path, kind: messages.BagKind, mcap: bool) -> rosbag1.Writer | rosbag2.Writer:
     if kind == "bag":
         return rosbag1.Writer(path)
     plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
@@ -178,7 +169,7 @@ def _open_writer(path: Path, kind: BagKind, mcap: bool) -> rosbag1.Writer | rosb
     return writer
 
 
-def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
+def require_stamps(first_ns: int, last_ns: int, kind: messages.BagKind) -> None:
     """Refuse stamps that such a bag cannot hold.
 
     Raises:
@@ -191,7 +182,7 @@ def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
 
 
 def write_recording(
-    kind: BagKind, recording: Recording, path: Path, overwrite: bool = False
+    kind: messages.BagKind, recording: Recording, path: Path, overwrite: bool = False
 ) -> list[str]:
     """Write a recording as a ROS bag: scans, odometry, and the sensors' extrinsics.
 
@@ -211,7 +202,9 @@ def write_recording(
     lasers = LaserScanEncoder(recording) if recording.dimension == 2 else None
     with new_bag(path, kind, overwrite=overwrite) as bag:
         frames = write_sensor_frames(bag, recording)
-        topic, type = ("scan", LASER_SCAN) if lasers is not None else ("points", POINT_CLOUD)
+        topic, type = "points", messages.POINT_CLOUD
+        if lasers is not None:
+            topic, type = "scan", messages.LASER_SCAN
         sends = [bag.add_topic(f"/{name}", type) for name in number_names(topic, len(frames))]
         send_odometry = _odometry_sender(bag, recording)
         for t in recording.iter_scans(range(recording.n_scans)):
@@ -234,7 +227,7 @@ def write_sensor_frames(
     """Write the sensors' extrinsics to /tf_static, and more transforms; returns their S frames."""
     name = "laser" if recording.dimension == 2 else "lidar"
     frames = number_names(name, len(recording.T_base_sensor))
-    send = bag.add_topic("/tf_static", TF, latched=True)
+    send = bag.add_topic("/tf_static", messages.TF, latched=True)
     if recording.n_scans:
         first = int(recording.stamp_ns[0])
         poses = [(BASE, f, T) for f, T in zip(frames, recording.T_base_sensor, strict=True)]
@@ -252,8 +245,8 @@ def _odometry_sender(bag: BagWriter, recording: Recording) -> Callable[[int], No
     T_odom_base = recording.T_odom_base
     if T_odom_base is None:
         return lambda t: None  # noqa: ARG005
-    send_tf = bag.add_topic("/tf", TF)
-    send_odometry = bag.add_topic("/odom", ODOMETRY)
+    send_tf = bag.add_topic("/tf", messages.TF)
+    send_odometry = bag.add_topic("/odom", messages.ODOMETRY)
 
     def send(t: int) -> None:
         stamp, T = int(recording.stamp_ns[t]), T_odom_base[t]
