@@ -3,6 +3,7 @@
 import json
 import math
 import tomllib
+from dataclasses import asdict
 
 import pytest
 
@@ -10,7 +11,7 @@ from stillmap.cli.arguments import options_from_args
 from stillmap.cli.console import print_json
 from stillmap.cli.main import main
 from stillmap.cli.parser import parser
-from stillmap.core.config import iter_options, to_dict
+from stillmap.core.config import iter_options
 from stillmap.pipeline.options import Options
 
 
@@ -38,7 +39,7 @@ def without_none(options: dict) -> dict:
 
 
 def test_prints_every_option_with_its_default(capsys):
-    assert tomllib.loads(config(capsys)) == without_none(to_dict(Options()))
+    assert tomllib.loads(config(capsys)) == without_none(asdict(Options()))
 
 
 def test_config_takes_its_own_output_unchanged(capsys, tmp_path):

@@ -244,11 +244,6 @@ def merge_nested(*changes: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def to_dict(options: Any) -> dict[str, Any]:
-    """Options as plain nested dictionaries."""
-    return dataclasses.asdict(options)
-
-
 def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
     """All options, section by section; options of a section come before its sub-sections."""
     for name, declared in declared_options(type(options)).items():

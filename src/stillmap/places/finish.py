@@ -2,7 +2,7 @@
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import write_npy, write_npz
-from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
 from stillmap.core.files import package_version, write_text
 from stillmap.core.input_files import read_bytes
@@ -205,7 +204,7 @@ def place_record(
         },
         "dimension": place.dimension,
         **({LOCAL_ORIGIN: origin.tolist()} if origin.any() else {}),
-        "options": to_dict(options),
+        "options": asdict(options),
         "iterations": [],
         "counts": {"scans": len(labels.stamp_ns), **count_labels(labels.hit, labels.p_static)},
         "area": {"known": round(known * place.resolution**2, 6)},

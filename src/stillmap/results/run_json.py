@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
-from stillmap.core.config import to_dict
 from stillmap.core.files import package_version
 from stillmap.core.json import to_jsonable
 from stillmap.core.tiles import tiles_of
@@ -44,7 +43,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "format_version": FORMAT_VERSION,
         "version": package_version(),
         "input": result.recording.source.to_dict(),
-        "options": to_dict(result.options),
+        "options": dataclasses.asdict(result.options),
         "iterations": [dataclasses.asdict(it) for it in result.iterations],
         "converged": result.converged,
         "best_iteration": result.best_iteration,
