@@ -15,6 +15,11 @@ from stillmap.prepare.time_window import TimeWindow, select_time
 START = 1_600_000_000  # s
 PERIOD = 0.1  # s between scans
 N = 16  # beams
+ENDINGS = {"carmen": ".clf", "bag": ".bag", "db3": ".db3", "mcap": ".mcap"}  # of files, by format
+CASES = [  # formats that hold recordings of each dimension
+    *((2, form) for form in (*ENDINGS, "ros2", "stillmap")),
+    *((3, form) for form in ("bag", "mcap", "kitti", "pcd", "stillmap")),
+]
 # noted, so that writers of parts state the angles and limits of the whole to the last digit
 _LASER = SensorNotes(
     start_angle=-1.0,
@@ -53,11 +58,18 @@ def cut(recording: Recording, first: float, last: float) -> Recording:
     return replace(part, source=recording.source)
 
 
-def write_parts(recording: Recording, folder: Path, form: str, ending: str, *spans) -> list[str]:
+def write_whole(recording: Recording, folder: Path, form: str) -> Path:
+    """Write a recording as a file or folder; returns its path."""
+    path = folder / f"whole{ENDINGS.get(form, '')}"
+    writers.write(recording, path, name=form)
+    return path
+
+
+def write_parts(recording: Recording, folder: Path, form: str, *spans) -> list[str]:
     """Write parts (first, last second) as files `part_K`; returns their paths."""
     out = []
     for number, (first, last) in enumerate(spans):
-        path = folder / f"part_{number}{ending}"
+        path = folder / f"part_{number}{ENDINGS.get(form, '')}"
         writers.write(cut(recording, first, last), path, name=form)
         out.append(str(path))
     return out

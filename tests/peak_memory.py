@@ -3,6 +3,14 @@
 import subprocess
 import sys
 
+READ = """
+import sys
+import stillmap
+try:
+    stillmap.read(sys.argv[1])
+except stillmap.InputError as error:
+    print(error)
+"""
 # the peak of `getrusage` begins with the memory of the process that started this one
 _REPORT = """
 from pathlib import Path

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from peak_memory import run_measured
+from peak_memory import READ, run_measured
 
 from stillmap.core.errors import InputError
 from stillmap.core.source import Skipped
@@ -135,22 +135,22 @@ def test_layers_that_are_not_there_take_no_memory(tmp_path):
     # after the first point and the count of points: bytes of the second layer
     struct.pack_into("<I", content, start + 8 + 30 + 4 + 4, 2**32 - 1)
     path.write_bytes(content)
-    code = """
-import sys
-from stillmap.core.errors import InputError
-from stillmap.io import read
-try:
-    read(sys.argv[1])
-except InputError as error:
-    print(error)
-"""
-    said, peak = run_measured(code, path)
+    said, peak = run_measured(READ, path)
     assert said == [f"{path}: is damaged: the sizes of its layers"]
     assert peak < 500
 
 
-@pytest.mark.parametrize(("name", "start"), [("a.las", b"LASF"), ("a.e57", b"ASTM-E57")])
-def test_missing_libraries_are_named(tmp_path, monkeypatch, name, start):
+PACKED = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary_compressed\n\x08\0\0\0\x18"
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "library"),
+    [
+        *(("a.las", b"LASF", "laspy"), ("a.e57", b"ASTM-E57", "pye57")),
+        ("a.pcd", PACKED, "lzf"),
+    ],
+)
+def test_missing_libraries_are_named(tmp_path, monkeypatch, name, start, library):
     (tmp_path / name).write_bytes(start + bytes(300))
 
     def missing(name):
@@ -158,5 +158,5 @@ def test_missing_libraries_are_named(tmp_path, monkeypatch, name, start):
 
     monkeypatch.setattr("stillmap.core.errors.import_module", missing)
     for path in (tmp_path / name, tmp_path):
-        with pytest.raises(InputError, match=r"pip install .*\[io\]"):
+        with pytest.raises(InputError, match=rf"needs {library} .*pip install .*\[io\]"):
             read(path)

@@ -168,11 +168,10 @@ def test_e57_that_promises_more(scanned, count):
     assert damage == Skipped(1, [1])
 
 
-def test_e57_with_entities_is_refused(scanned):
-    path, *_ = scanned
-    described(path, lambda xml: xml.replace(b"?>", b'?><!DOCTYPE a [<!ENTITY b "c">]>', 1))
+def test_e57_with_entities_is_refused(write_e57):
+    defined = b'?><!DOCTYPE a [<!ENTITY b "c">]>'
     with pytest.raises(InputError, match="entities"):
-        read(path)
+        read(write_e57(lambda xml: xml.replace(b"?>", defined, 1)))
 
 
 @pytest.mark.parametrize("kept", [10, 48, 1024, 5000])

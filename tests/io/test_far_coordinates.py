@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
@@ -11,21 +12,15 @@ from stillmap.io.trajectory import read_tum, write_tum
 UTM = np.array([500_000.0, 5_300_000.0, 800.0])
 
 
-def write_ply(path, points):
-    table = np.zeros(len(points), [(axis, "<f8") for axis in "xyz"])
-    for axis, column in zip("xyz", points.T, strict=True):
-        table[axis] = column
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
-    head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
-    path.write_bytes(head.encode() + table.tobytes())
-
-
 @pytest.fixture
 def cloud(tmp_path):
     """(200, 3) points in a projection, and a file of them."""
-    points = np.random.default_rng(3).uniform(-20.0, 20.0, (200, 3)) + UTM
-    write_ply(tmp_path / "cloud.ply", points)
-    return points, tmp_path / "cloud.ply"
+    points = np.random.default_rng(3).uniform(-20.0, 20.0, (200, 3)).astype(np.float32)
+    recording = of_one_sensor(np.zeros(1, np.int64), np.array([0, 200]), points, np.ones(200, bool))
+    T = np.eye(4)[None]
+    T[0, :3, 3] = UTM
+    ply.write(recording, tmp_path / "cloud.ply", T)
+    return points + UTM, tmp_path / "cloud.ply"
 
 
 def test_a_cloud_is_converted_where_it_was(cloud, tmp_path):

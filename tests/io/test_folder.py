@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recordings import of_one_sensor
+from recordings import ARRAYS, of_one_sensor, require_same_arrays
 
 from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
@@ -16,11 +16,6 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes, Source
 from stillmap.io import read, write
 from stillmap.prepare.options import ReadOptions
-
-ARRAYS = (
-    *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
-    *("T_odom_base", "beam_time", "T_recorded_base"),
-)
 
 
 def made(D=2, odometry=True, counts=(3, 0, 4), beam_times=True, recorded=True):
@@ -49,13 +44,7 @@ def made(D=2, odometry=True, counts=(3, 0, 4), beam_times=True, recorded=True):
 
 
 def require_same(a, b):
-    for name in ARRAYS:
-        left, right = getattr(a, name), getattr(b, name)
-        if left is None or right is None:
-            assert left is right
-            continue
-        assert left.dtype == right.dtype
-        np.testing.assert_array_equal(left, right)
+    require_same_arrays(a, b)
     assert a.source == b.source
 
 

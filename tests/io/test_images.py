@@ -34,18 +34,12 @@ def said(path: Path) -> str:
     return str(caught.value)
 
 
-def test_what_is_no_picture_is_named_once(picture):
-    picture.write_bytes(b"nothing")
-    assert said(picture) == f"{picture}: is no image, or damaged"
-
-
-def test_a_picture_that_is_cut(picture):
+def test_a_picture_that_is_damaged_or_gone(picture):
     picture.write_bytes(picture.read_bytes()[:1000])
     assert read_image_size(picture) == (32, 32)
     assert said(picture) == f"{picture}: is no image, or damaged"
-
-
-def test_a_picture_that_is_gone(picture):
+    picture.write_bytes(b"nothing")
+    assert said(picture) == f"{picture}: is no image, or damaged"
     picture.unlink()
     assert said(picture) == f"{picture}: cannot be read: No such file or directory"
     picture.mkdir()

@@ -3,29 +3,24 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes, Source
 from stillmap.io import laser_scan
 
 
-def recording(scans, *, hit=None, sensors=(), sensor=None, beam_time=None):
+def recording(scans, *, sensors=(), beam_time=None):
     """A recording of scans given by (angles, ranges); NaN ranges are unusable beams."""
     points = [
         np.stack([r * np.cos(a), r * np.sin(a)], axis=-1)
         for a, r in ((np.asarray(a, float), np.asarray(r, float)) for a, r in scans)
     ]
-    T, flat = len(scans), np.concatenate(points).astype(np.float32)
-    usable = ~np.isnan(flat[:, 0])
-    sensor = np.zeros(T, np.int32) if sensor is None else np.asarray(sensor, np.int32)
-    return Recording(
-        stamp_ns=np.arange(T, dtype=np.int64),
-        offset=np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
-        points=flat,
-        hit=usable if hit is None else np.asarray(hit),
-        T_base_sensor=np.tile(np.eye(3), (sensor.max(initial=0) + 1, 1, 1)),
-        sensor=sensor,
-        T_odom_base=None,
+    flat = np.concatenate(points).astype(np.float32)
+    return of_one_sensor(
+        np.arange(len(scans), dtype=np.int64),
+        np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
+        flat,
+        ~np.isnan(flat[:, 0]),
         source=Source(sensors=list(sensors)),
         beam_time=None if beam_time is None else np.asarray(beam_time, np.float32),
     )

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cut_recordings import PERIOD, START, N, cut, make_recording, write_parts
+from cut_recordings import CASES, PERIOD, START, N, cut, make_recording, write_parts, write_whole
+from recordings import require_same_arrays
 
 from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
@@ -15,45 +16,16 @@ from stillmap.io import read, writers
 from stillmap.io.reader import join_recordings, read_parts
 from stillmap.pipeline import inputs
 
-FORMS = {
-    2: {
-        "carmen": ".clf",
-        "bag": ".bag",
-        "db3": ".db3",
-        "mcap": ".mcap",
-        "ros2": "",
-        "stillmap": "",
-    },
-    3: {"bag": ".bag", "mcap": ".mcap", "kitti": "", "pcd": "", "stillmap": ""},
-}
-CASES = [(dimension, form) for dimension, forms in FORMS.items() for form in forms]
 SPANS = ((0.0, 1.9), (2.0, 3.4), (3.5, 5.9))
-FIELDS = (
-    *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
-    *("T_odom_base", "T_recorded_base", "beam_time"),
-)
-
-
-def require_equal(a, b):
-    for name in FIELDS:
-        one, other = getattr(a, name), getattr(b, name)
-        assert (one is None) == (other is None), name
-        if one is not None:
-            np.testing.assert_array_equal(one, other, err_msg=name)
-
-
-def write_whole(recording, folder, form, ending):
-    writers.write(recording, folder / f"whole{ending}", name=form)
-    return folder / f"whole{ending}"
 
 
 @pytest.mark.parametrize(("dimension", "form"), CASES)
 def test_parts_in_any_order_are_the_whole(dimension, form, tmp_path):
-    ending, recording = FORMS[dimension][form], make_recording(dimension)
-    paths = write_parts(recording, tmp_path, form, ending, *SPANS)
-    whole = read(write_whole(recording, tmp_path, form, ending))
+    recording = make_recording(dimension)
+    paths = write_parts(recording, tmp_path, form, *SPANS)
+    whole = read(write_whole(recording, tmp_path, form))
     joined = inputs.read([paths[k] for k in (2, 0, 1)])
-    require_equal(joined, whole)
+    require_same_arrays(joined, whole)
     noted = joined.source.parts
     assert [part.path for part in noted] == paths
     assert [part.scans for part in noted] == [20, 15, 25]
@@ -62,7 +34,7 @@ def test_parts_in_any_order_are_the_whole(dimension, form, tmp_path):
 
 
 def test_lines_that_the_first_part_of_a_log_alone_has(tmp_path, drive):
-    write_whole(drive, tmp_path, "carmen", ".log")
+    writers.write(drive, tmp_path / "whole.log")
     lines = (tmp_path / "whole.log").read_text().splitlines(keepends=True)
     head = [line for line in lines if not line.startswith(("FLASER", "ODOM", "ROBOTLASER"))]
     rows = [line for line in lines if line not in head]
@@ -72,13 +44,13 @@ def test_lines_that_the_first_part_of_a_log_alone_has(tmp_path, drive):
     (tmp_path / "b.log").write_text("\ufeff" + "".join(rows[31:]))
     paths = [str(tmp_path / name) for name in ("b.log", "a.log")]
     joined = inputs.read(paths)
-    require_equal(joined, read(tmp_path / "whole.log"))
+    require_same_arrays(joined, read(tmp_path / "whole.log"))
     assert joined.source.details["lines"] == len(rows) + 2
     assert joined.T_base_sensor[0, 0, 2] == 0.25
 
 
 def test_damage_in_a_later_part_is_counted_at_its_line(tmp_path, drive):
-    paths = write_parts(drive, tmp_path, "carmen", ".log", (0.0, 2.9), (3.0, 5.9))
+    paths = write_parts(drive, tmp_path, "carmen", (0.0, 2.9), (3.0, 5.9))
     first, second = (Path(path).read_text() for path in paths)
     before = len(first.splitlines())
     kind = second.splitlines()[-1].split()[0]
@@ -88,7 +60,7 @@ def test_damage_in_a_later_part_is_counted_at_its_line(tmp_path, drive):
 
 
 def test_an_unreadable_part_is_named(tmp_path, drive):
-    paths = write_parts(drive, tmp_path, "carmen", ".log", (0.0, 5.9))
+    paths = write_parts(drive, tmp_path, "carmen", (0.0, 5.9))
     with pytest.raises(InputError, match="does not exist") as caught:
         inputs.read([*paths, tmp_path / "gone.log"])
     assert caught.value.where == str(tmp_path / "gone.log")
@@ -99,11 +71,11 @@ def test_large_parts_are_joined_in_files(tmp_path, drive, monkeypatch):
     monkeypatch.setattr(arrays, "BLOCK", 100)
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    paths = write_parts(drive, tmp_path, "stillmap", "", (0.0, 2.5), (2.6, 5.9))
+    paths = write_parts(drive, tmp_path, "stillmap", (0.0, 2.5), (2.6, 5.9))
     joined = read_parts(paths, scratch=scratch)
     assert isinstance(joined.points, np.ndarray)
     assert not joined.points.flags.owndata  # mapped
-    require_equal(joined, read(write_whole(drive, tmp_path, "stillmap", "")))
+    require_same_arrays(joined, read(write_whole(drive, tmp_path, "stillmap")))
     assert list(scratch.iterdir()) == []
 
 
@@ -144,7 +116,7 @@ def test_a_raw_kitti_drive_in_pieces(tmp_path):
         text = "".join(f"{stamps[k]}\n" for k in rows)
         (folder / "velodyne_points/timestamps.txt").write_text(text)
     joined = inputs.read([tmp_path / "b", tmp_path / "a"])
-    require_equal(joined, read(whole))
+    require_same_arrays(joined, read(whole))
     assert joined.beam_time is not None
 
 
@@ -198,7 +170,7 @@ def test_what_does_not_follow_is_refused_and_merge_named(tmp_path, drive, why):
 @pytest.mark.parametrize("speed", [0.5, 20.0])
 def test_a_pause_is_bridged(tmp_path, speed):
     whole = make_recording(speed=speed)
-    paths = write_parts(whole, tmp_path, "stillmap", "", (0.0, 1.9), (2.9, 5.9))
+    paths = write_parts(whole, tmp_path, "stillmap", (0.0, 1.9), (2.9, 5.9))
     assert inputs.read(paths).n_scans == 20 + 31
     with pytest.raises(InputError, match="no recording is named"):
         inputs.read([])

@@ -265,15 +265,3 @@ def test_a_scan_without_points_is_a_scan_in_a_folder(tmp_path):
     np.testing.assert_array_equal(read(tmp_path).offset, [0, 2, 2])
     with pytest.raises(InputError, match="holds no points"):
         read(tmp_path / "2.pcd")
-
-
-def test_the_library_that_unpacks_is_an_extra(tmp_path, monkeypatch):
-    write(tmp_path / "a.pcd", made([[1.0, 2, 3]] * 100), "binary_compressed")
-
-    def missing(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr("stillmap.core.errors.import_module", missing)
-    for path in (tmp_path / "a.pcd", tmp_path):
-        with pytest.raises(InputError, match=r"needs lzf.*pip install .*\[io\]"):
-            read(path)

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 import pytest
-from peak_memory import run_measured
+from peak_memory import READ, run_measured
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -19,14 +19,6 @@ from stillmap.io.rgbd import T_BASE_CAMERA
 from stillmap.prepare import prepare
 from stillmap.prepare.options import ReadOptions
 
-READ = """
-import sys
-import stillmap
-try:
-    stillmap.read(sys.argv[1])
-except stillmap.InputError as error:
-    print(error)
-"""
 W, H = 64, 48
 K = np.array([[60.0, 0.0, 31.5], [0.0, 58.0, 23.5], [0.0, 0.0, 1.0]])
 ROOM = (np.array([-3.0, -2.0, 0.0]), np.array([3.0, 2.0, 2.4]))  # m, its corners

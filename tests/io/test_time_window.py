@@ -1,32 +1,19 @@
 """A part of a recording by time: the same scans whatever the format."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from cut_recordings import PERIOD, START, N, make_recording
+from cut_recordings import CASES, PERIOD, START, N, make_recording, write_whole
 
 from stillmap.core.errors import InputError
-from stillmap.io import read, writers
+from stillmap.io import read
 from stillmap.prepare.options import ReadOptions
 
-FORMS_2D = {"carmen": ".clf", "bag": ".bag", "db3": ".db3", "mcap": ".mcap", "stillmap": ""}
-FORMS_3D = {"mcap": ".mcap", "kitti": "", "pcd": "", "stillmap": ""}
 T = 60
-
-
-def written(dimension: int, form: str, folder: Path) -> Path:
-    ending = (FORMS_2D if dimension == 2 else FORMS_3D)[form]
-    writers.write(make_recording(dimension), folder / f"made{ending}", name=form)
-    return folder / f"made{ending}"
-
-
-CASES = [(2, form) for form in FORMS_2D] + [(3, form) for form in FORMS_3D]
 
 
 @pytest.mark.parametrize(("dimension", "form"), CASES)
 def test_a_part_holds_the_scans_between_its_limits(dimension, form, tmp_path):
-    path = written(dimension, form, tmp_path)
+    path = write_whole(make_recording(dimension), tmp_path, form)
     whole = read(path)
     for start, end, first, last in (
         (0.5, 1.0, 5, 10),  # both limits included
@@ -50,7 +37,7 @@ def test_a_part_holds_the_scans_between_its_limits(dimension, form, tmp_path):
 
 @pytest.mark.parametrize(("dimension", "form"), CASES)
 def test_an_empty_part_names_the_span(dimension, form, tmp_path):
-    path = written(dimension, form, tmp_path)
+    path = write_whole(make_recording(dimension), tmp_path, form)
     for start, end in ((10.0, None), (0.31, 0.39), (1.0, 0.5), (None, START - 5.0)):
         with pytest.raises(InputError, match=r"has no scan .*spans 0 to 5\.90 s") as caught:
             read(path, ReadOptions(start=start, end=end))
@@ -59,7 +46,7 @@ def test_an_empty_part_names_the_span(dimension, form, tmp_path):
 
 
 def test_clouds_outside_are_not_opened(tmp_path):
-    path = written(3, "kitti", tmp_path)
+    path = write_whole(make_recording(3), tmp_path, "kitti")
     (path / "velodyne" / "000000.bin").write_bytes(b"no cloud")
     part = read(path, ReadOptions(start=1.0))
     assert part.n_scans == T - 10

@@ -130,12 +130,7 @@ def test_unsupported_recordings(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.log"]
 
 
-@pytest.mark.parametrize("name", ["aces.clf.gz"])
-def test_public_logs(shared_data, tmp_path, name):
-    recording = read(shared_data / "laser2d" / name)
-    writers.write(recording, tmp_path / "a.log")
-    found = read(tmp_path / "a.log")
-    np.testing.assert_array_equal(found.stamp_ns, recording.stamp_ns)
-    np.testing.assert_array_equal(found.hit, recording.hit)
+def test_a_public_log(shared_data, tmp_path):
+    recording = read(shared_data / "laser2d" / "aces.clf.gz")
+    found = again(recording, tmp_path / "a.log")
     np.testing.assert_allclose(found.points, recording.points, rtol=0, atol=6e-5)
-    np.testing.assert_allclose(found.T_odom_base, recording.T_odom_base, rtol=0, atol=2e-6)

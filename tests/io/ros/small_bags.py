@@ -13,6 +13,7 @@ from stillmap.io.ros.message_fields import make_header
 from stillmap.io.ros.messages import load_typestore
 from stillmap.io.ros.writer import make_message
 
+START, SECOND = 1_700_000_000_000_000_000, 10**9  # ns: of the first message, and between some
 KINDS = ("bag", "db3", "mcap", "folder")
 FLOAT, DOUBLE, UINT32, UINT16 = 7, 8, 6, 4
 _KINDS = {FLOAT: "f4", DOUBLE: "f8", UINT32: "u4", UINT16: "u2"}
@@ -47,10 +48,6 @@ class Messages:
         kind = "sensor_msgs/msg/LaserScan"
         return kind, self.make(kind, header=self.header(stamp, frame), ranges=ranges, **fields)
 
-    def pose(self, xyz: tuple[float, float, float], theta: float, flipped: bool = False) -> Any:
-        c, s = np.cos(0.5 * theta), np.sin(0.5 * theta)
-        return xyz, (c, s, 0.0, 0.0) if flipped else (0.0, 0.0, s, c)
-
     def transform(
         self, stamp: int, parent: str, child: str, xyz: Any, q: Any = (0.0, 0.0, 0.0, 1.0)
     ) -> Any:
@@ -72,6 +69,13 @@ class Messages:
         if self.encoding == "ros1":
             return bytes(self.store.serialize_ros1(message, kind))
         return bytes(self.store.serialize_cdr(message, kind))
+
+
+def turned(theta: float, over: float = 0.0) -> tuple[float, float, float, float]:
+    """Quaternion of a yaw after a roll."""
+    c, s = np.cos(theta / 2), np.sin(theta / 2)
+    a, b = np.cos(over / 2), np.sin(over / 2)
+    return (c * b, s * b, s * a, c * a)
 
 
 def _placed(xyz: Any, q: Any, *names: str) -> dict[str, Any]:

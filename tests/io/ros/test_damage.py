@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
-from small_bags import Messages, write_bag
+from small_bags import SECOND, START, Messages, write_bag
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.builder import TIME_BACKWARDS
 from stillmap.io.ros import lasers
 from stillmap.io.ros.messages import UNREADABLE
-
-START = 1_700_000_000_000_000_000
-SECOND = 10**9
 
 
 def scans_of(messages, n, **changes):
@@ -118,7 +115,6 @@ def test_headers_without_stamps(bag, messages):
 def test_invalid_transforms(bag, messages):
     content = scans_of(messages, 3)
     bad = [
-        messages.transform(START, "odom", "base_link", (np.nan, 0, 0)),
         messages.transform(START, "odom", "base_link", (0, 0, 0), (0, 0, 0, 0)),
         messages.transform(START, "odom", "odom", (0, 0, 0)),
         messages.transform(START, "", "base_link", (0, 0, 0)),
@@ -126,7 +122,7 @@ def test_invalid_transforms(bag, messages):
     content.append(("/tf", START, messages.tf(*bad)))
     recording = read(bag(content))
     assert recording.T_odom_base is None
-    assert recording.source.skipped_odometry["transform that is none"].count == 4
+    assert recording.source.skipped_odometry["transform that is none"].count == 3
 
 
 @pytest.mark.parametrize(
@@ -173,8 +169,3 @@ def test_other_files(tmp_path, content, text):
     with pytest.raises(InputError, match=text) as caught:
         read(path)
     assert str(path) in str(caught.value)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(11)

@@ -7,7 +7,7 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from small_bags import FLOAT, UINT16, UINT32, cloud_message, write_bag
+from small_bags import FLOAT, SECOND, START, UINT16, UINT32, cloud_message, write_bag
 
 from stillmap.io import read
 from stillmap.io.filtered_clouds import FilterJob, Omissions
@@ -16,9 +16,6 @@ from stillmap.io.ros.filtered import write_filtered
 from stillmap.io.ros.messages import load_typestore
 from stillmap.io.ros.writer import _TRANSIENT_LOCAL
 from stillmap.prepare.options import ReadOptions
-
-START = 1_700_000_000_000_000_000
-SECOND = 10**9
 
 
 def filtered(source, out, recording, blank):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_bags import Messages, write_bag
+from small_bags import START, Messages, write_bag
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
@@ -18,8 +18,6 @@ from stillmap.io.ros import limits
 from stillmap.io.ros.messages import Channel, Message
 from stillmap.io.ros.reader import collect_messages
 from stillmap.prepare.options import ReadOptions
-
-START = 1_700_000_000_000_000_000
 
 
 def scans_of(messages, n=3):

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from small_bags import DOUBLE, FLOAT, UINT16, UINT32, cloud_message
+from small_bags import DOUBLE, FLOAT, SECOND, START, UINT16, UINT32, cloud_message
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.ros import clouds as cloud_module
 from stillmap.prepare.options import ReadOptions
-
-START = 1_700_000_000_000_000_000
-SECOND = 10**9
 
 
 def xyz(rng, n=12):

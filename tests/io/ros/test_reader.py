@@ -2,22 +2,14 @@
 
 import numpy as np
 import pytest
+from recordings import require_same_arrays
+from small_bags import SECOND, START, turned
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.pipeline import inputs
 from stillmap.prepare.options import ReadOptions
-
-START = 1_700_000_000_000_000_000
-SECOND = 10**9
-
-
-def turned(theta, over=0.0):
-    """Quaternion of a yaw after a roll."""
-    c, s = np.cos(theta / 2), np.sin(theta / 2)
-    a, b = np.cos(over / 2), np.sin(over / 2)
-    return (c * b, s * b, s * a, c * a)
 
 
 def ranges_at(k, n=5):
@@ -166,8 +158,7 @@ def test_a_split_bag_is_the_whole_one(bag, messages):
     spans = ((0, 45), (45, 80), (80, None))
     paths = [str(bag(content[slice(*span)], f"part_{k}")) for k, span in enumerate(spans)]
     joined = inputs.read(paths[::-1])
-    for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "T_odom_base", "sensor"):
-        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name), err_msg=name)
+    require_same_arrays(joined, whole)
     assert joined.source.base_frame == "base_link"
     assert sum(one.scans for one in joined.source.parts) == 40
     assert joined.source.warnings == whole.source.warnings

@@ -5,7 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from small_bags import Messages, write_bag
+from small_bags import Messages, turned, write_bag
 
 from stillmap.cli.main import main
 from stillmap.core import se2
@@ -75,16 +75,14 @@ def bag_of(folder, rig, joint_ns=None, kind="mcap"):
     if joint_ns is None:
         joint_ns = np.arange(first, last, JOINT_NS)
     x, y, yaw = se2.parameters(flat.T_base_sensor)[0]
-    turned = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
-    fixed = messages.transform(first, "base_link", "laser", (x, y, 0.35), turned)
+    fixed = messages.transform(first, "base_link", "laser", (x, y, 0.35), turned(yaw))
     content = [("/tf_static", first, messages.tf(fixed))]
     content += [("/scan", at, m) for at, m in scans(messages, flat, "laser", laser)]
     content += [("/tilt_scan", at, m) for at, m in scans(messages, tilting, "tilt", laser)]
     content += [("/tf", at, m) for at, m in joint_messages(messages, rig, joint_ns)]
     for stamp, T in zip(flat.stamp_ns.tolist(), flat.T_odom_base, strict=True):
         x, y, yaw = se2.parameters(T[None])[0]
-        turned = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
-        at = messages.tf(messages.transform(stamp, "odom", "base_link", (x, y, 0.0), turned))
+        at = messages.tf(messages.transform(stamp, "odom", "base_link", (x, y, 0.0), turned(yaw)))
         content.append(("/tf", stamp, at))
     return write_bag(folder, kind, messages, sorted(content, key=lambda one: one[1]), "rig")
 
