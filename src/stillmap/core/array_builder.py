@@ -28,8 +28,8 @@ class ArrayBuilder:
         self, dtype: DTypeLike, row: tuple[int, ...] = (), folder: Path | None = None
     ) -> None:
         self._dtype, self._row, self._folder = np.dtype(dtype), row, folder
-        self._buffer, self._written, self._length = bytearray(), 0, 0  # bytes in memory, in file
-        self._file: IO[bytes] | None = None
+        self._buffer, self._length = bytearray(), 0  # of the rows in memory; of all
+        self._file: GrowingArray | None = None
 
     def __len__(self) -> int:
         return self._length
@@ -53,9 +53,9 @@ class ArrayBuilder:
     def _write(self) -> None:
         """Write the rows that are in memory."""
         if self._file is None:
-            self._file = arrays.open_unlinked(self._folder)
-        _write_at(self._file, self._written, self._buffer)
-        self._written += len(self._buffer)
+            self._file = GrowingArray(self._dtype, self._row, scratch=self._folder)
+        length = self._length - len(self._file)
+        self._file.append(np.ndarray((length, *self._row), self._dtype, self._buffer))
         self._buffer = bytearray()
 
     def close(self) -> None:
@@ -70,11 +70,10 @@ class ArrayBuilder:
         Raises:
             OSError: the disk is full.
         """
-        shape = (self._length, *self._row)
-        if self._file is not None:
-            self._write()
-            return arrays.map_file(self._file, shape, self._dtype, writable=False)
-        return np.ndarray(shape, self._dtype, self._buffer[:])
+        if self._file is None:
+            return np.ndarray((self._length, *self._row), self._dtype, self._buffer[:])
+        self._write()
+        return self._file.view()
 
     def finish(self) -> Array:
         """The array (N, *row), read-only where it is memory-mapped. Ends appending.

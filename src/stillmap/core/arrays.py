@@ -82,7 +82,8 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) 
     with open_unlinked(folder) as file:
         # a hole that no longer fits on the disk would kill the process by SIGBUS
         os.posix_fallocate(file.fileno(), 0, size)
-        return map_file(file, shape, dtype, writable=True)
+        mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
+        return mapped.reshape(shape)
 
 
 def release_pages(array: NDArray[Any]) -> None:
@@ -160,16 +161,6 @@ def open_unlinked(folder: Path | None) -> IO[bytes]:
         return os.fdopen(os.open(folder, flags, 0o600), "w+b")
     except (AttributeError, OSError):  # the system, or the file system, has none such
         return cast(IO[bytes], tempfile.TemporaryFile(prefix="stillmap-", dir=folder))
-
-
-def map_file(
-    file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any], writable: bool
-) -> NDArray[Any]:
-    """Memory-map an array at the begin of a file."""
-    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
-    mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), size, access=access), dtype)
-    return mapped.reshape(shape)
 
 
 def write_npy(path: Path, array: NDArray[Any]) -> None:
