@@ -74,16 +74,8 @@ _OWN: dict[str, tuple[str, str, Write]] = {
     "ROS bag": ("", "metadata.yaml", load_later("ros.filtered", "write_filtered")),
     "CARMEN log": ("carmen", "", load_later("carmen.writer", "write_filtered")),
     "KITTI folder": ("kitti", "velodyne*", write_kitti),
-    "PCD": (
-        "pcd",
-        "*.[pP][cC][dD]",
-        partial(write_files, extensions=pcd.EXTENSIONS, filter_file=filter_pcd),
-    ),
-    "PLY": (
-        "ply",
-        "*.[pP][lL][yY]",
-        partial(write_files, extensions=ply.EXTENSIONS, filter_file=filter_ply),
-    ),
+    "PCD": ("pcd", "*.[pP][cC][dD]", partial(write_files, filter_pcd, pcd.EXTENSIONS)),
+    "PLY": ("ply", "*.[pP][lL][yY]", partial(write_files, filter_ply, ply.EXTENSIONS)),
     "LAS": ("las", "*.[lL][aA][sSzZ]", write_las),
 }
 

@@ -143,10 +143,10 @@ def write_las(job: FilterJob) -> Omissions:
     """Copy a LAS or LAZ file or folder without some points; version, format and records stay."""
     ending = job.output.suffix.lower()
     packed = ending == ".laz" if job.source.is_file() and ending in las.EXTENSIONS else None
-    return write_files(job, las.EXTENSIONS, partial(_filter_las, packed=packed))
+    return write_files(partial(_filter_las, packed=packed), las.EXTENSIONS, job)
 
 
-def write_files(job: FilterJob, extensions: tuple[str, ...], filter_file: FilterFile) -> Omissions:
+def write_files(filter_file: FilterFile, extensions: tuple[str, ...], job: FilterJob) -> Omissions:
     """Copy the one file, or the folder, of a recording; files that were not read are left out."""
     files = files_of(job.source, extensions)
     masks = dict(zip(files, job.scan_masks(len(files)), strict=True))

@@ -327,11 +327,8 @@ def _find_base_frame(
 def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
     """2D poses (N, 3, 3) of a laser, whether it is mounted upside down, whether it is tilted."""
     up = T[:, 2, 2]
-    return (
-        se2.project_to_plane(T),
-        bool(np.median(up) < 0.0),
-        bool(np.any(np.abs(up) < _MIN_UPRIGHT)),
-    )
+    tilts = bool(np.any(np.abs(up) < _MIN_UPRIGHT))
+    return se2.project_to_plane(T), bool(np.median(up) < 0.0), tilts
 
 
 def find_odometry(
