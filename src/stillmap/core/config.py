@@ -247,11 +247,8 @@ def merge_nested(*changes: Mapping[str, Any]) -> dict[str, Any]:
 def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
     """All options, section by section; options of a section come before its sub-sections."""
     for name, declared in declared_options(type(options)).items():
-        kind = (
-            "list"
-            if typing.get_origin(declared.kind) is tuple
-            else getattr(declared.kind, "__name__", "str")
-        )
+        is_list = typing.get_origin(declared.kind) is tuple
+        kind = "list" if is_list else getattr(declared.kind, "__name__", "str")
         kind = ("str" if declared.choices else kind) + " or unset" * (declared.default is None)
         # what every integer has to fit into is no range
         limits = describe_range({k: v for k, v in declared.limits.items() if v != _MAX_INTEGER})

@@ -251,13 +251,9 @@ class SkippedRecords:
         """A warning where more than a few of the scans were skipped, of which `kept` remain."""
         if self.total <= _MAX_LOSS * (kept + self.total):
             return []
-        return [
-            advise(
-                f"{self.total} of {kept + self.total} scans are damaged and were skipped: "
-                f"{self.summary(unit)}",
-                "copy the recording again; if it was recorded so, look whether the map has gaps",
-            )
-        ]
+        skipped = f"{self.total} of {kept + self.total} scans are damaged and were skipped"
+        todo = "copy the recording again; if it was recorded so, look whether the map has gaps"
+        return [advise(f"{skipped}: {self.summary(unit)}", todo)]
 
     def by_reason(self) -> dict[str, Skipped]:
         """As `Recording.source` notes them, with the first `MAX_LINE_NUMBERS` numbers each."""

@@ -273,13 +273,9 @@ def read_depth_camera(
     if camera.K is None:
         fx, cx, cy, _ = _USUAL[frames.format]
         camera = replace(camera, K=np.array([[fx, 0.0, cx], [0.0, fx, cy], [0.0, 0.0, 1.0]]))
-        warnings.append(
-            advise(
-                f"no calibration of the depth camera: a focal length of {fx:g} pixels and the "
-                f"centre at {cx:g}, {cy:g} are assumed, the default of {frames.format}",
-                "give that of your camera by read.cameras",
-            )
-        )
+        assumed = f"a focal length of {fx:g} pixels and the centre at {cx:g}, {cy:g} are assumed"
+        what = f"no calibration of the depth camera: {assumed}, the default of {frames.format}"
+        warnings.append(advise(what, "give that of your camera by read.cameras"))
     error = camera_module.calibration_error(camera)
     if error:
         raise InputError(f"cannot be used: {error}", where=str(frames.depth[0][1]))
@@ -345,13 +341,9 @@ def _read_color_images(
     width, height = size
     camera = replace(depth, name=COLOR, width=width, height=height)
     if size != (depth.width, depth.height):
-        warnings.append(
-            advise(
-                f"color images have {width} x {height} pixels, depth images {depth.width} x "
-                f"{depth.height}: the color camera is not calibrated",
-                "give its calibration by read.cameras",
-            )
-        )
+        sizes = f"{width} x {height} pixels, depth images {depth.width} x {depth.height}"
+        what = f"color images have {sizes}: the color camera is not calibrated"
+        warnings.append(advise(what, "give its calibration by read.cameras"))
         camera = replace(camera, K=None, model="", distortion=np.zeros(0))
     elif scale is not None:
         color = dict(frames.color)

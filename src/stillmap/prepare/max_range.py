@@ -137,11 +137,8 @@ def infer_range_rule(
                 f"({limit.how}), whose readings count as hits"
             )
     no_return = ranges >= np.float32(MAX_PLAUSIBLE_RANGE if threshold is None else threshold)
-    coded = (
-        limit.coded
-        or bool(np.any(ranges >= MAX_PLAUSIBLE_RANGE))
-        or no_return.mean() > MIN_ZERO_SHARE
-    )
+    has_infinite = bool(np.any(ranges >= MAX_PLAUSIBLE_RANGE))
+    coded = limit.coded or has_infinite or no_return.mean() > MIN_ZERO_SHARE
     share = float(no_return.mean()) if coded and ranges.size else 0.0
     zero_means = _zero_meaning(ranges, share, options.zero_means)
     is_hit = (ranges >= np.float32(max(options.min_range, MAX_ZERO_RANGE))) & ~no_return
@@ -152,12 +149,9 @@ def infer_range_rule(
         sectors = find_self_sectors(np.atleast_2d(ranges), min_range)
     rule = RangeRule(threshold, how, zero_means, free, options.min_range, sectors)
     if free is None:
-        warnings.append(
-            advise(
-                "the maximum range of the laser is unknown: maximum-range beams are unusable",
-                "give it by read.max_range, so that they show free space",
-            )
-        )
+        what = "the maximum range of the laser is unknown: maximum-range beams are unusable"
+        todo = "give it by read.max_range, so that they show free space"
+        warnings.append(advise(what, todo))
     return rule, warnings
 
 
