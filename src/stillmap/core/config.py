@@ -106,13 +106,11 @@ class Declaration(NamedTuple):
         return typing.get_args(self.kind) if is_choice else ()
 
 
+@cache
 def declared_options(kind: Any) -> dict[str, Declaration]:
     """The options of a class by name; sections are none, nor fields of a plain dataclass."""
-    return _declare_all(kind) if issubclass(kind, CheckedOptions) else {}
-
-
-@cache
-def _declare_all(kind: type[CheckedOptions]) -> dict[str, Declaration]:
+    if not issubclass(kind, CheckedOptions):
+        return {}
     hints = typing.get_type_hints(kind, include_extras=True)
     fields = [
         field for field in dataclasses.fields(kind) if not dataclasses.is_dataclass(field.default)
@@ -194,9 +192,10 @@ def override(options: T, changes: Mapping[str, Any], where: str = "") -> T:
 
 def _override(options: T, changes: Mapping[str, Any], where: str, prefix: str, top: Any) -> T:
     values: dict[str, Any] = {}
+    known = {*declared_options(type(options)), *_section_names(options)}
     for key, value in changes.items():
         name = f"{prefix}{key}"
-        if not isinstance(key, str) or key not in _names(options):
+        if not isinstance(key, str) or key not in known:
             near = closest_match(name, iter_names(top), min_similarity=0.0)
             raise InputError(f"unknown option '{name}'", where=where, hint=f"nearest: '{near}'")
         current = getattr(options, key)
@@ -367,7 +366,3 @@ def _heading(options: Any, section: str) -> Iterator[str]:
 def _section_names(options: Any) -> list[str]:
     names = [field.name for field in dataclasses.fields(options)]
     return [name for name in names if dataclasses.is_dataclass(getattr(options, name))]
-
-
-def _names(options: Any) -> set[str]:
-    return {*declared_options(type(options)), *_section_names(options)}

@@ -180,13 +180,11 @@ def read_times(path: Path) -> list[int | None]:
     Raises:
         InputError: the file cannot be read.
     """
-    out: list[int | None] = []
-    for line in read_lines(path):
-        out.append(_parse_line(line.text.decode("ascii", "replace").strip()))
-    end = len(out)
-    while end and out[end - 1] is None:
-        end -= 1
-    return out[:end]
+    texts = (line.text.decode("ascii", "replace").strip() for line in read_lines(path))
+    out = list(map(_parse_line, texts))
+    while out and out[-1] is None:
+        out.pop()
+    return out
 
 
 def _parse_line(text: str) -> int | None:

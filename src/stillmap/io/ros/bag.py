@@ -103,19 +103,17 @@ class _IndexedFile:
     def records(self, wanted: Collection[int], since_ns: int | None) -> Iterator[Record]:
         """The messages of these channels, from a log time on."""
         connections = [c for c in self._reader.connections if c.id in wanted]
-        source = self._reader.messages(connections, start=since_ns) if connections else iter(())
-        while True:
-            try:
-                connection, log_ns, raw = next(source)
-            except StopIteration:
-                return
-            except InputError:
-                raise
-            except Exception as error:  # any error of rosbags about damaged bytes
-                raise DamagedBagError(str(error) or type(error).__name__) from error
-            if not (is_log_time(log_ns) and isinstance(raw, bytes)):
-                raise DamagedBagError("a message without time or content")
-            yield connection.id, log_ns, raw
+        if not connections:
+            return
+        try:
+            for connection, log_ns, raw in self._reader.messages(connections, start=since_ns):
+                if not (is_log_time(log_ns) and isinstance(raw, bytes)):
+                    raise DamagedBagError("a message without time or content")
+                yield connection.id, log_ns, raw
+        except (InputError, DamagedBagError):
+            raise
+        except Exception as error:  # any error of rosbags about damaged bytes
+            raise DamagedBagError(str(error) or type(error).__name__) from error
 
 
 def _channel(connection: Any) -> Channel:

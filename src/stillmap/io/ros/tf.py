@@ -14,7 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.timestamps import order_in_time
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.io.trajectory import MAX_TRANSLATION, describe_odometry
+from stillmap.io.trajectory import MAX_TRANSLATION, describe_odometry, poses_from_rows
 from stillmap.prepare.options import ReadOptions
 
 BAD_TRANSFORM = "transform that is none"
@@ -80,10 +80,7 @@ class Motion:
         stamps, values = np.asarray(self.stamp_ns), np.asarray(self.values).reshape(-1, 7)
         if self.constant or len(stamps) == 1:
             outside = 0 if self.constant else int(np.count_nonzero(at_ns != stamps[0]))
-            T = np.eye(4)
-            T[:3, :3] = Rotation.from_quat(values[0, 3:]).as_matrix()
-            T[:3, 3] = values[0, :3]
-            return np.broadcast_to(T, (len(at_ns), 4, 4)), outside
+            return np.broadcast_to(poses_from_rows(values[:1]), (len(at_ns), 4, 4)), outside
         inside = np.clip(at_ns, stamps[0], stamps[-1])
         # relative to the first stamp: float64 does not hold nanoseconds since 1970
         known, wanted = (stamps - stamps[0]) / 1e9, (inside - stamps[0]) / 1e9
