@@ -9,8 +9,8 @@ import numpy as np
 
 from stillmap.core.array_types import Cells, Float
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import cell_keys
 from stillmap.mapping.change_detection import Change
-from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door_states import is_passage_observed, observe_states
 from stillmap.mapping.doors import Door, Sector, fit_sector
 from stillmap.mapping.resting_leaf import find_resting_leaf

@@ -16,7 +16,7 @@ from stillmap.core import arrays
 from stillmap.core.array_types import Cells, Float, Float32, Index, Int64
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
-from stillmap.mapping.changed_objects import cell_keys
+from stillmap.core.square_box import cell_keys
 from stillmap.mapping.door_states import (
     INNER,
     find_hit_cells,
