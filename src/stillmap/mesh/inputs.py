@@ -38,6 +38,13 @@ class TrackedBox(NamedTuple):
     bottom: Float
     height: float
 
+    def pose_at(self, seconds: Float) -> tuple[Float, Float, Float]:
+        """Center (n, 2) metres, heading (n, 2) and height of the lower side (n,) at times (n,)."""
+        box = self.box
+        at = np.clip(np.searchsorted(box.seconds, seconds, side="right") - 1, 0, None)
+        bottom = np.interp(seconds, box.seconds, self.bottom)
+        return box.center_at(seconds), box.heading[at], bottom
+
     def motion_until(self, now: float, seconds: Float) -> Float:
         """(n, 2) metres by which the box moves from times (n,) to a time."""
         return self.box.center_at(np.array([now])) - self.box.center_at(seconds)
@@ -105,23 +112,14 @@ class ObjectFrame(NamedTuple):
 
     def to_object(self, seconds: Float, points: Float) -> Float:
         """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
-        box = self.box.box
-        center = box.center_at(seconds)
-        heading = box.heading[np.clip(np.searchsorted(box.seconds, seconds, "right") - 1, 0, None)]
+        center, heading, bottom = self.box.pose_at(seconds)
         off = points[:, :2] - center
-        bottom = np.interp(seconds, box.seconds, self.box.bottom)
-        at = np.stack(
-            [
-                (off * heading).sum(axis=1),
-                off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1],
-                points[:, 2] - bottom,
-            ],
-            axis=1,
-        )
+        ahead = (off * heading).sum(axis=1)
+        left = off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1]
         dx, dy, turn = (np.interp(seconds, self.seconds, column) for column in self.offset.T)
         c, s = np.cos(turn), np.sin(turn)
-        x, y = c * at[:, 0] - s * at[:, 1] + dx, s * at[:, 0] + c * at[:, 1] + dy
-        return np.stack([x, y, at[:, 2]], axis=1)
+        x, y = c * ahead - s * left + dx, s * ahead + c * left + dy
+        return np.stack([x, y, points[:, 2] - bottom], axis=1)
 
     def T_map_object(self, seconds: float) -> Float:
         """(4, 4) pose of the object's frame at a time."""
@@ -157,14 +155,12 @@ class OrientedBox(NamedTuple):
 def boxes_at(boxes: Sequence[TrackedBox], seconds: float) -> list[OrientedBox]:
     """The boxes that exist at a time, in seconds of their tracks."""
     out = []
-    for box, bottom, height in boxes:
-        if max(box.seconds[0] - seconds, seconds - box.seconds[-1]) > box.hold:
-            continue
-        xy = box.center_at(np.array([seconds]))[0]
-        at = max(int(np.searchsorted(box.seconds, seconds, side="right")) - 1, 0)
-        low = float(np.interp(seconds, box.seconds, bottom))
-        center = np.array([*xy, low + 0.5 * height])
-        out.append(OrientedBox(center, box.heading[at], np.array([*box.half_size, 0.5 * height])))
+    for tracked in boxes:
+        box, half_height = tracked.box, 0.5 * tracked.height
+        if max(box.seconds[0] - seconds, seconds - box.seconds[-1]) <= box.hold:
+            (xy,), (heading,), (low,) = tracked.pose_at(np.array([seconds]))
+            center, half_size = [*xy, low + half_height], [*box.half_size, half_height]
+            out.append(OrientedBox(np.array(center), heading, np.array(half_size)))
     return out
 
 
@@ -307,6 +303,14 @@ class MeshInputs:
         a = int(np.searchsorted(stamps, first - slack)) - _SCANS_AROUND
         b = int(np.searchsorted(stamps, last + slack, side="right")) + _SCANS_AROUND
         return slice(max(a, 0), min(b, len(stamps)))
+
+    def beams_within(self, first: float, last: float) -> tuple[Index, Float]:
+        """The beams (n,) between two times, and their times (n,)."""
+        scans, offset = self.scans_within(first, last), self.deskewed.offset
+        beams = np.arange(offset[scans.start], offset[scans.stop])
+        seconds = self.seconds_of(beams)
+        within = (seconds >= first) & (seconds <= last)
+        return beams[within], seconds[within]
 
     @cached_property
     def _beams_of_boxes(self) -> list[tuple[TrackedBox, Index]]:

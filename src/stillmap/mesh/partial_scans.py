@@ -64,11 +64,8 @@ def extract_partial_scan(
     """
     inputs, around = returns.inputs, _CONTEXT if fast else 0.0
     first, last = span[0] - around, span[1] + around
-    scans, deskewed = inputs.scans_within(first, last), inputs.deskewed
-    beams = np.arange(deskewed.offset[scans.start], deskewed.offset[scans.stop])
-    seconds = inputs.seconds_of(beams)
-    then = (seconds >= first) & (seconds <= last)
-    beams, seconds = beams[then], seconds[then]
+    deskewed = inputs.deskewed
+    beams, seconds = inputs.beams_within(first, last)
     origin = inputs.T_map_sensor[deskewed.scans_of(beams), :3, 3]
     mine = within_time(own, returns.seconds, first, last)
     if fast:
@@ -366,8 +363,6 @@ def _correspondences(
 
 def surface_distance(one: PartialSurface, known: PartialSurface) -> float:
     """Metres, third quartile of a surface's distances from another; NaN: too little in common."""
-    if not len(known.mesh.vertices):
-        return float("nan")
     residual = _correspondences(one.sample(_POINTS), known, _RADII[0])[2]
     if len(residual) < _MIN_POINTS:
         return float("nan")

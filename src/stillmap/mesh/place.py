@@ -218,10 +218,8 @@ class Background:
 
 
 def sample_buffer(values: NDArray[np.generic], buffer: DepthBuffer, at: Float) -> Float:
-    """(...,) values of an image (h, w) of a z-buffer at points (..., 3) in the camera's frame."""
+    """(n,) values of an image (h, w) of a z-buffer at points (n, 3) in the camera's frame."""
     h, w = values.shape
-    column, row = (
-        np.rint(a).astype(np.intp) for a in project_pinhole(buffer.K, at.reshape(-1, 3).T)
-    )
+    column, row = (np.rint(a).astype(np.intp) for a in project_pinhole(buffer.K, at.T))
     found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
-    return np.asarray(found.reshape(at.shape[:-1]), np.float64)
+    return np.asarray(found, np.float64)

@@ -86,10 +86,7 @@ def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
 
 
 def choose_resolution(
-    recording: Recording,
-    poses: Float,
-    layout: ScanLayout,
-    voxel_size: float | None = None,
+    recording: Recording, poses: Float, layout: ScanLayout, voxel_size: float | None
 ) -> tuple[float, int]:
     """The edge of a voxel in metres, and the stride of rows and columns of range images.
 
@@ -151,7 +148,7 @@ def build_surface(
     recording: Recording,
     poses: Float,
     p_static: Float32,
-    options: MeshOptions | None = None,
+    options: MeshOptions,
     threads: int = 1,
     tell: Tell = no_tell,
 ) -> Mesh:
@@ -165,7 +162,6 @@ def build_surface(
         threads: same result with any number.
         tell: called with the work done and the total.
     """
-    options = options or MeshOptions()
     T = recording.T_map_sensor(poses)
     chosen = select_scans(T, recording.sensor, median_range(recording))
     layout = find_scan_layout(recording, chosen)

@@ -23,14 +23,9 @@ _RELATIVE_TOLERANCE = 0.005  # m more per metre of distance
 _SLOPE_TOLERANCE = 0.05  # m per metre of distance, at most, for slanted faces
 _DILATION = 1  # pixels around a face in which much nearer depth occludes it: poses are inexact
 
-
-# weights of the corners at the samples of a face: center, near corners, near middles of edges
-_SAMPLES = (
-    np.array(
-        [[3, 3, 3], [7, 1, 1], [1, 7, 1], [1, 1, 7], [4, 4, 1], [1, 4, 4], [4, 1, 4]], np.float64
-    )
-    / 9.0
-)
+# ninths, weights of the corners at the samples of a face: center, near corners, near edges' middles
+_NINTHS = (3, 3, 3), (7, 1, 1), (1, 7, 1), (1, 1, 7), (4, 4, 1), (1, 4, 4), (4, 1, 4)
+_SAMPLES = np.array(_NINTHS, np.float64) / 9.0
 
 
 @dataclass(frozen=True, eq=False)
