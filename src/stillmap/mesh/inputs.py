@@ -11,6 +11,7 @@ import numpy as np
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, max_scan_duration_ns
+from stillmap.core.segments import segments_meet_box
 from stillmap.em import GroundMap
 from stillmap.mesh.range_image import has_planar_scans
 from stillmap.tracking import MovingObject
@@ -181,7 +182,7 @@ def occlusion_probability(boxes: Sequence[OrientedBox], position: Float, points:
         shown = np.zeros(len(near))
         for growth in reversed(_GROWTHS):
             half_size = one.half_size + OUTLINE_MARGIN + growth * _OUTLINE_SIGMA
-            shown[intersects_box(start, ends, half_size)] = _P_IN_BOX * np.exp(-0.5 * growth**2)
+            shown[segments_meet_box(start, ends, half_size)] = _P_IN_BOX * np.exp(-0.5 * growth**2)
         free[near] *= 1.0 - shown
     return 1.0 - free
 
@@ -190,7 +191,7 @@ def is_in_or_behind_box(boxes: Sequence[OrientedBox], position: Float, points: F
     """(n,) whether the line of sight from a camera (3,) to points (n, 3) meets a box."""
     out = np.zeros(len(points), np.bool_)
     for one, near, start, ends in _sights_near_boxes(boxes, position, points, 0.0):
-        out[near] |= intersects_box(start, ends, one.half_size)
+        out[near] |= segments_meet_box(start, ends, one.half_size)
     return out
 
 
@@ -216,25 +217,6 @@ def squared_segment_distances(center: Float, along: Float, square: Float) -> Flo
     dot = center[0] * along[0] + center[1] * along[1] + center[2] * along[2]
     share = np.clip(dot / square, 0.0, 1.0)
     return np.asarray(center @ center + share * (share * square - 2.0 * dot))
-
-
-def intersects_box(start: Float, ends: Float, half_size: Float) -> Bool:
-    """(n,) whether segments from `start` (3,) to `ends` (n, 3) meet a box around the origin.
-
-    Slab test: a segment lies between each pair of faces over an interval of its length.
-    """
-    enters, leaves = np.full(len(ends), -np.inf), np.full(len(ends), np.inf)
-    for axis in range(3):
-        along = ends[:, axis] - start[axis]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one = (-half_size[axis] - start[axis]) / along
-            other = (half_size[axis] - start[axis]) / along
-        first, last = np.minimum(one, other), np.maximum(one, other)
-        # parallel to the faces: all of the segment lies between them, or nothing
-        beside = np.inf if abs(start[axis]) > half_size[axis] else -np.inf
-        first[along == 0.0], last[along == 0.0] = beside, -beside
-        enters, leaves = np.maximum(enters, first), np.minimum(leaves, last)
-    return np.asarray((enters <= leaves) & (leaves >= 0.0) & (enters <= 1.0))
 
 
 _SCANS_AROUND = 1  # before and after a time, whose beams may be of it

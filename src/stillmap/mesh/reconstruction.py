@@ -246,6 +246,7 @@ def _fuse_patches(patches: Sequence[Patch]) -> Mesh:
     """One surface of several partial surfaces, by TSDF integration."""
     return integrate_patches(
         [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches],
+        len(patches),
         object_voxel_size(patches),
         truncation=_TRUNCATION,
         min_weight=min(_MIN_VIEWS, _MIN_VIEW_SHARE * len(patches)),

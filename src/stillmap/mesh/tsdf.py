@@ -173,22 +173,15 @@ def build_surface(
         patch = make()
         return patch, static_weights(patch, p_static)
 
-    def patches() -> Iterable[tuple[Patch, Float32]]:
-        made = map_ordered(weighted, triangulate_scans(recording, poses, layout), threads)
-        for done, one in enumerate(made, start=1):
-            yield one
-            tell(done, 2 * n)
-
-    def tell_later(done: int, total: int) -> None:
-        tell(n + n * done // total, 2 * n)
-
+    patches = map_ordered(weighted, triangulate_scans(recording, poses, layout), threads)
     return integrate_patches(
-        patches(), voxel, max_faces=options.max_faces, threads=threads, tell=tell_later
+        patches, n, voxel, max_faces=options.max_faces, threads=threads, tell=tell
     )
 
 
 def integrate_patches(
     patches: Iterable[tuple[Patch, Float32]],
+    n: int,
     voxel: float,
     *,
     truncation: tuple[float, float] = _TRUNCATION,
@@ -202,26 +195,27 @@ def integrate_patches(
 
     Args:
         patches: each with the weights (m,) of its faces; those of weight 0 are left out.
+        n: number of patches.
         voxel: edge in metres.
         truncation: voxels in front of and behind a surface in which distances are stored.
         min_weight: voxels need more weight than this.
         min_area: square metres; smaller connected components are dropped.
         max_faces: triangle budget.
         threads: same result with any number.
-        tell: called with the tiles done and the total, after integration.
+        tell: called with the work done and the total.
     """
     front, back = (voxel * share for share in truncation)
     volume = _core.TsdfVolume(voxel, truncation_front=front, truncation_back=back)
-    for patch, weight in patches:
-        volume.integrate(
-            patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
-        )
+    for done, (patch, weight) in enumerate(patches, start=1):
+        at = (patch.points, patch.origin, patch.standoff)
+        volume.integrate(*at, patch.faces, weight, threads=threads)
+        tell(done, 2 * n)
     error = simplification_error(voxel)
     tiles, _ = unique_cells(volume.blocks() // (TILE // volume.block_edge))
     parts = list[Mesh]()
     for done, tile in enumerate(tiles, start=1):
         parts.append(simplify(extract_tile(volume, tile, min_weight), error))
-        tell(done, len(tiles))
+        tell(n + n * done // len(tiles), 2 * n)
     del volume  # frees the voxels before the mesh grows
     mesh = remove_small_components(weld(concatenate_meshes(parts)), min_area)
     return simplify_to_budget(simplify(mesh, error), error, max_faces)
