@@ -68,9 +68,8 @@ def compute_p_moved(
     for stamps, (_, gaps) in zip(observations, spans, strict=True):
         ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
         # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
-        log_still = -_RATES * ends - np.logaddexp(
-            np.outer(_RATES, gaps), -np.outer(_RATES, gaps)
-        ).sum(axis=1)
+        swings = np.outer(_RATES, gaps)
+        log_still = -_RATES * ends - np.logaddexp(swings, -swings).sum(axis=1)
         log_still += len(gaps) * math.log(2.0)
         moved.append(1.0 - float(posterior @ np.exp(log_still)))
     return np.array(same), np.array(moved)
@@ -88,9 +87,8 @@ def _log_likelihood_of_swings(door: Door) -> Float:
     Each state lasts from the first to the last time the leaf was seen so; it may have moved to and
     fro meanwhile.
     """
-    since, until = (
-        1e-9 * np.array([[state.since_ns, state.until_ns] for state in door.states], float).T
-    )
+    spans = np.array([[state.since_ns, state.until_ns] for state in door.states], float)
+    since, until = 1e-9 * spans.T
     between = np.maximum(since[1:] - until[:-1], _LEAST)
     differs = 0.5 * -np.expm1(-2.0 * np.outer(_RATES, between))
     same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, until - since)))
@@ -100,10 +98,8 @@ def _log_likelihood_of_swings(door: Door) -> Float:
 def _split_observations(stamps: Int64) -> tuple[float, Float]:
     """Seconds in which a leaf was watched, and the gaps between them."""
     pauses = 1e-9 * (stamps[1:, 0] - stamps[:-1, 1]).astype(np.float64)
-    watched = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum()) + float(
-        pauses[pauses <= _WATCHED].sum()
-    )
-    return watched, pauses[pauses > _WATCHED]
+    observed = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum())
+    return observed + float(pauses[pauses <= _WATCHED].sum()), pauses[pauses > _WATCHED]
 
 
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
@@ -138,22 +134,16 @@ def find_lone_doors(
     if not doorways:
         return []
     counts = _count_beams(recording, poses, resolution, threads)
-    left = [
-        (leaf, is_open)
-        for doorway in doorways
-        if is_doorway_free(doorway, counts)
-        for leaf, is_open in (
-            (find_open_leaf(doorway, surface), True),
-            (find_shut_leaf(doorway, surface), False),
-        )
-        if leaf is not None and len(leaf.cells)  # of coarse cells, all may be at the wall
-    ]
+    free = [doorway for doorway in doorways if is_doorway_free(doorway, counts)]
+    found = [(find_open_leaf(doorway, surface), True) for doorway in free]
+    found += [(find_shut_leaf(doorway, surface), False) for doorway in free]
     taken = [door.swept_cells for door in doors]
     leaves: list[tuple[LoneLeaf, bool]] = []
-    for leaf, is_open in sorted(left, key=lambda lone: not lone[1]):
-        if (not is_open or is_thin(leaf, counts)) and not any(
-            _is_part(leaf.cells, cells) for cells in taken
-        ):
+    for leaf, is_open in found:
+        if leaf is None or not len(leaf.cells):  # of coarse cells, all may be at the wall
+            continue
+        is_leaf = not is_open or is_thin(leaf, counts)
+        if is_leaf and not any(_is_part(leaf.cells, cells) for cells in taken):
             taken.append(leaf.cells)
             leaves.append((leaf, is_open))
     return _observe(leaves, doors, recording, poses, resolution)

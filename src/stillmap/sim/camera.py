@@ -294,9 +294,7 @@ class CameraSimulator:
         rng = np.random.default_rng((self.colour_seed, image))
         o = self._options
         gain = np.exp(o.exposure * rng.standard_normal())
-        noise = o.noise * rng.standard_normal(color.shape, dtype=np.float32)
-        out: Color = np.clip(np.rint(gain * color + noise), 0, 255).astype(np.uint8)
-        return out
+        return _to_uint8(gain * color + o.noise * rng.standard_normal(color.shape, np.float32))
 
 
 def _to_rays(direction: Float, at: Float) -> Rays:

@@ -92,9 +92,8 @@ class Stay:
     until: float | None = None
 
     def __post_init__(self) -> None:
-        options.require(
-            self.until is None or self.until > self.since, "a stay must end after it began"
-        )
+        lasts = self.until is None or self.until > self.since
+        options.require(lasts, "a stay must end after it began")
 
 
 @dataclass(frozen=True)
@@ -110,9 +109,8 @@ class Thing:
     stays: tuple[Stay, ...]
 
     def __post_init__(self) -> None:
-        options.require(
-            len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays"
-        )
+        is_whole = len(self.faces) > 0 and len(self.stays) > 0
+        options.require(is_whole, "a thing needs faces and stays")
         for stay, later in itertools.pairwise(self.stays):
             in_order = stay.until is not None and stay.until <= later.since
             options.require(in_order, "stays of a thing must come one after the other")

@@ -96,9 +96,8 @@ def explain_hits(
     log_ratio = compute_log_ratio(explained, np.maximum(others, 0.0))
     on_vehicle = is_vehicle[path]
     by_vehicles = np.bincount(place, weight * on_vehicle, minlength=len(places)).astype(np.float64)
-    p_place = np.where(
-        on_vehicle, fit_share(log_ratio, by_vehicles)[place], compute_probability(log_ratio)[place]
-    )
+    of_vehicles, of_walkers = fit_share(log_ratio, by_vehicles), compute_probability(log_ratio)
+    p_place = np.where(on_vehicle, of_vehicles[place], of_walkers[place])
     out = arrays.copy(p_static, recording.scratch)
     out[beam] *= (1.0 - weight * (1.0 - p_place)).astype(np.float32)
     return out

@@ -219,9 +219,8 @@ def _extend(clusters: _Clusters, seeds: _Seeds) -> _Seeds:
     xy = clusters.edge[later, seeds.side[which]]
     off = xy - seeds.xy[which, -1] - dt[:, None] * velocity[which]
     along = (off * u[which]).sum(axis=1) / _GATE_ALONG
-    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / (
-        _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
-    )
+    gate = _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
+    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / gate
     cost = along**2 + across**2
     near = np.flatnonzero(cost < 1.0)
     order = near[np.lexsort((cost[near], which[near]))]
