@@ -334,7 +334,7 @@ def likelihood_of_misses(counts: Float32) -> Float32:
 @functools.cache
 def _table() -> Float32:
     """(N, N, 2) by the numbers of misses and of those with hits in the surroundings."""
-    n, k = np.indices((_MAX_MISSES + 1, _MAX_MISSES + 1))
+    n, k = np.indices((_MAX_MISSES + 1, _MAX_MISSES + 1)).astype(np.float64)
     rest = np.maximum(n - k, 0)
     lasting = log_beta(k + _LASTING, rest + 1.0)
     logs = np.stack([lasting, log_beta(k + 1.0, rest + _LASTING)], axis=2)

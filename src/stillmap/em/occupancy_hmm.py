@@ -52,9 +52,8 @@ def e_step(
         threads: does not change the result.
     """
     observations = collect_observations(recording, poses, resolution, options, threads)
-    return label_beams(
-        observations, None, fit_classes(observations, None, options), recording, poses
-    )
+    fit = fit_classes(observations, None, options)
+    return label_beams(observations, None, fit, recording, poses)
 
 
 def e_step_3d(

@@ -122,11 +122,9 @@ def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
             leaf = find_resting_leaf(cells, others, resolution)
             cells = np.unique(np.concatenate([cells, leaf]), axis=0)
             sector = fit_sector(cells, resolution) if len(leaf) else None
-        if (
-            sector is not None
-            and sector.length * resolution >= _MIN_LEAF
-            and _MIN_SWING <= sector.angle <= _MAX_SWING
-        ):
+        if sector is None or sector.length * resolution < _MIN_LEAF:
+            continue
+        if _MIN_SWING <= sector.angle <= _MAX_SWING:
             candidates.append(_Candidate(sector, group, cells, rests))
     return sorted(candidates, key=lambda candidate: (candidate.rests, -len(candidate.cells)))
 

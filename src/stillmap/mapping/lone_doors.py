@@ -68,8 +68,8 @@ def compute_p_moved(
     for stamps, (_, gaps) in zip(observations, spans, strict=True):
         ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
         # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
-        swings = np.outer(_RATES, gaps)
-        log_still = -_RATES * ends - np.logaddexp(swings, -swings).sum(axis=1)
+        expected = np.outer(_RATES, gaps)  # swings within each gap
+        log_still = -_RATES * ends - np.logaddexp(expected, -expected).sum(axis=1)
         log_still += len(gaps) * math.log(2.0)
         moved.append(1.0 - float(posterior @ np.exp(log_still)))
     return np.array(same), np.array(moved)
@@ -188,10 +188,9 @@ def _observe(
         else:
             lone_doors.append(door)
             lone_observations.append(seen)
-    lone_doors = _rate_lone(
-        lone_doors, lone_observations, [*doors, *passed_doors], recording.stamp_ns
-    )
-    return [*passed_doors, *lone_doors]
+    swung = [*doors, *passed_doors]
+    rated = _rate_lone(lone_doors, lone_observations, swung, recording.stamp_ns)
+    return [*passed_doors, *rated]
 
 
 def _find_passages(
@@ -222,9 +221,8 @@ def _rate_lone(
     is_open = np.array([len(door.open_cells) > 0 for door in lone], bool)
     same, moved = compute_p_moved(swung, observations, stamp_ns)
     p_door = np.full(len(lone), _P_LEAF)
-    p_door[~is_open] = estimate_p_door(
-        estimate_shut_share(swung) * same[~is_open], len(swung) + int(is_open.sum())
-    )
+    p_shut = estimate_shut_share(swung) * same[~is_open]
+    p_door[~is_open] = estimate_p_door(p_shut, len(swung) + int(is_open.sum()))
     return [
         dataclasses.replace(lone[k], p_moved=float(moved[k] * p_door[k]))
         for k in np.flatnonzero(p_door >= _MIN_P_LISTED).tolist()

@@ -144,9 +144,8 @@ def _is_grazing(spans: Float, edges: Float, sight: Float, limit: float, max_dept
     sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
     deep = np.abs(np.einsum("nki,ni->nk", spans, sight))
     across = np.sqrt(np.maximum(edges**2 - deep**2, 0.0)).max(axis=1)
-    return np.asarray(
-        (across <= limit) & (deep.max(axis=1) <= np.minimum(max_depth, _MAX_STEEPNESS * across))
-    )
+    max_depths = np.minimum(max_depth, _MAX_STEEPNESS * across)
+    return np.asarray((across <= limit) & (deep.max(axis=1) <= max_depths))
 
 
 def _project_perspective(sensor: Float, center: Float, points: Float) -> tuple[Float, Bool]:

@@ -200,11 +200,8 @@ def _merge_partial_scans(
     best = int(np.argmin([abs(surface.time_offset) for surface in surfaces]))
     motion = register_surfaces(surfaces, best)
     moved = [surface.transform(motion) for surface in surfaces]
-    kept = [
-        k
-        for k, surface in enumerate(moved)
-        if k == best or surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET
-    ]
+    fits = [surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET for surface in moved]
+    kept = [k for k, is_near in enumerate(fits) if is_near or k == best]
     if len(kept) < max(2.0, _MIN_KEPT_SHARE * len(surfaces)):
         return None
     mesh = _fuse_patches([moved[k].to_patch() for k in kept])

@@ -253,9 +253,8 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     # scikit-image tests the mask at the last corner of a cube
     mask = np.zeros(metres.shape, np.bool_)
     mask[1:, 1:, 1:] = cubes
-    found, faces, _, _ = measure.marching_cubes(
-        np.where(known, metres, np.float32(1.0)), 0.0, mask=mask, gradient_direction="ascent"
-    )
+    values = np.where(known, metres, np.float32(1.0))
+    found, faces, *_ = measure.marching_cubes(values, 0.0, mask=mask, gradient_direction="ascent")
     vertices = found[:, ::-1].astype(np.float64) + first
     mesh = weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
     # vertices are counted from the center of voxel 0

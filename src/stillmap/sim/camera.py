@@ -54,14 +54,12 @@ def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) ->
     blur = np.broadcast_to(blur, x.shape)
     tile = _hash(np.floor(q / _TILE), seed)
     base = np.where((z > _FLOOR)[:, None], _WALLS[tile % 16], _FLOORS[tile % 8])
-    drift = np.stack(
-        [np.sin(0.9 * x + 0.5 * y + k) + np.sin(0.6 * y - 0.7 * x + 2 * k) for k in range(3)], 1
-    )
+    waves = [np.sin(0.9 * x + 0.5 * y + k) + np.sin(0.6 * y - 0.7 * x + 2 * k) for k in range(3)]
     chip = _hash(np.floor(q / _CHIP), seed + 1)
     light = _CHIPS * ((chip & 255) / 127.5 - 1.0) * _contrast(blur, _CHIP)
     along = np.where(tile & 256, q[:, 0] + q[:, 1], q[:, 1] - q[:, 2])
     light += _STRIPES * np.sin(2 * np.pi / _STRIPE * along) * _contrast(blur, _STRIPE)
-    colour = base * (1.0 + light[:, None] + _DRIFT / 2 * drift)
+    colour = base * (1.0 + light[:, None] + _DRIFT / 2 * np.stack(waves, 1))
     return _to_uint8(colour)
 
 

@@ -306,7 +306,6 @@ def _classify_places(points: Float32, place: Float) -> Index:
     count = near.sum(axis=1)
     past = 2 * (near & (distance[beams] > far[:, None] + _DEPTH)).sum(axis=1) > count
     before = 2 * (near & (distance[beams] < far[:, None] - _DEPTH)).sum(axis=1) > count
-    visibility = np.where(
-        past, Visibility.PASSED, np.where(before, Visibility.HIDDEN, Visibility.REACHED)
-    )
+    not_past = np.where(before, Visibility.HIDDEN, Visibility.REACHED)
+    visibility = np.where(past, Visibility.PASSED, not_past)
     return np.where(nearest > _MAX_BEARING, Visibility.HIDDEN, visibility).astype(np.intp)
