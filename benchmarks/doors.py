@@ -25,7 +25,7 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap.mapping.changed_objects import cell_keys
+from stillmap.core.square_box import cell_keys
 from stillmap.mapping.doors import Door
 from stillmap.pipeline import final_map
 from stillmap.results.eval.map import GHOST_DISTANCE, distance_to_walls

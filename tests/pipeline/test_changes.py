@@ -9,7 +9,8 @@ import pytest
 import stillmap
 from stillmap import em
 from stillmap.core.config import override
-from stillmap.mapping.changed_objects import cell_keys, find_shown_cells, pool_states
+from stillmap.core.square_box import cell_keys
+from stillmap.mapping.changed_objects import find_shown_cells, pool_states
 from stillmap.pipeline.options import Options
 from stillmap.results.map_server import CHANGED, changed_cells
 from stillmap.sim import Scene, simulate

@@ -141,7 +141,7 @@ def bound_box(
     whole = SquareBox(squares.min(axis=0), squares.max(axis=0)) if around is None else around
     if whole.area <= least:
         return whole
-    limit = min(max(least, _MOST_PER_SEEN * len(np.unique(_keys(squares)))), most)
+    limit = min(max(least, _MOST_PER_SEEN * len(np.unique(cell_keys(squares)))), most)
     if whole.area <= limit:
         return whole
     center = find_busiest(squares if places is None else places, math.isqrt(limit) // 2)
@@ -165,13 +165,13 @@ def _find_joined(squares: Squares, distance: Squares) -> NDArray[np.bool_]:
 
 def find_busiest(places: Squares, edge: int) -> Squares:
     """(2,) median of the places (K, 2) in the square of `edge` places that holds most of them."""
-    keys = _keys(places // max(edge, 1))
+    keys = cell_keys(places // max(edge, 1))
     number, count = np.unique(keys, return_counts=True)
     chosen = places[keys == number[np.argmax(count)]]
     middle: Squares = np.sort(chosen, axis=0)[len(chosen) // 2]
     return middle
 
 
-def _keys(squares: Squares) -> Squares:
-    """(N,) a number for each square (N, 2)."""
-    return np.asarray((squares[:, 0] << 32) + squares[:, 1])
+def cell_keys(cells: Squares) -> Squares:
+    """(...) a number for each cell (..., 2), in their order; there are far less than 2 ** 31."""
+    return np.asarray((cells[..., 0] << 32) + cells[..., 1], np.int64)

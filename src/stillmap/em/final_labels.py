@@ -15,12 +15,7 @@ from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import finite_rows
 from stillmap.core.recording import Recording
 from stillmap.em.change_hmm import CellHistories, ChangeMixture, change_parameters
-from stillmap.em.observations import (
-    HALF_TIME_RHO,
-    HmmClasses,
-    Observations,
-    collect_observations,
-)
+from stillmap.em.observations import HALF_TIME_RHO, HmmClasses, Observations, collect_observations
 from stillmap.em.occupancy_hmm import ClassFit, fit_classes, label_beams
 from stillmap.em.options import EmOptions
 from stillmap.em.shape_evidence import ShapeEvidence

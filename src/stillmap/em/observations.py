@@ -5,7 +5,6 @@ observation model; the kernels follow it.
 """
 
 import functools
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +16,7 @@ from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
-from stillmap.em.mixture import MAX_FIT_ROWS
+from stillmap.em.mixture import MAX_FIT_ROWS, log_beta
 from stillmap.em.options import EmOptions
 
 SurfelMap = _core.SurfelMap2D | _core.SurfelMap3D
@@ -335,15 +334,10 @@ def likelihood_of_misses(counts: Float32) -> Float32:
 @functools.cache
 def _table() -> Float32:
     """(N, N, 2) by the numbers of misses and of those with hits in the surroundings."""
-    size = _MAX_MISSES + 1
-    logs = np.zeros((size, size, 2))
-    for n in range(size):
-        for k in range(n + 1):
-            logs[n, k] = _log_beta(k + _LASTING, n - k + 1.0), _log_beta(k + 1.0, n - k + _LASTING)
+    n, k = np.indices((_MAX_MISSES + 1, _MAX_MISSES + 1)).astype(np.float64)
+    rest = np.maximum(n - k, 0)
+    lasting = log_beta(k + _LASTING, rest + 1.0)
+    logs = np.stack([lasting, log_beta(k + 1.0, rest + _LASTING)], axis=2)
     table = np.asarray(np.exp(logs - logs.max(axis=2, keepdims=True)), np.float32)
     table.setflags(write=False)
     return table
-
-
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)

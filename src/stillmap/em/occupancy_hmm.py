@@ -15,11 +15,7 @@ from stillmap.core.chunks import iter_beams
 from stillmap.core.parallel import map_ordered, work_beside
 from stillmap.core.recording import Recording
 from stillmap.em import spatial_coupling
-from stillmap.em.change_hmm import (
-    ChangeMixture,
-    change_parameters,
-    select_changed_cells,
-)
+from stillmap.em.change_hmm import ChangeMixture, change_parameters, select_changed_cells
 from stillmap.em.ground import ground_from_surfels
 from stillmap.em.mixture import fit_weights, posterior, posterior_static
 from stillmap.em.observations import (
@@ -56,9 +52,8 @@ def e_step(
         threads: does not change the result.
     """
     observations = collect_observations(recording, poses, resolution, options, threads)
-    return label_beams(
-        observations, None, fit_classes(observations, None, options), recording, poses
-    )
+    fit = fit_classes(observations, None, options)
+    return label_beams(observations, None, fit, recording, poses)
 
 
 def e_step_3d(
@@ -74,14 +69,7 @@ def e_step_3d(
 
     changes = change_parameters(recording, with_paths=options.change_detection_3d)
     observations = collect_observations(
-        recording,
-        poses,
-        resolution,
-        options,
-        threads,
-        _CLASSES_3D,
-        changes,
-        with_surroundings=True,
+        recording, poses, resolution, options, threads, _CLASSES_3D, changes, with_surroundings=True
     )
     surfel_map = observations.surfel_map
     assert isinstance(surfel_map, _core.SurfelMap3D)

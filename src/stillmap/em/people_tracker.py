@@ -55,12 +55,8 @@ def detect_segments(recording: Recording, T_map_sensor: Float) -> Detections:
     or cut by the field of view, is unknown.
     """
     parts = [_detect_in_chunk(recording, chunk) for chunk in iter_chunks(recording)]
-    scan, xy, width = (
-        np.concatenate(column)
-        for column in zip(
-            (np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0)), *parts, strict=True
-        )
-    )
+    none = (np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0))
+    scan, xy, width = (np.concatenate(column) for column in zip(none, *parts, strict=True))
     T = T_map_sensor[scan]
     xy = (T[:, :2, :2] * xy[:, None]).sum(axis=-1) + T[:, :2, 2]
     return Detections(scan, xy, width)

@@ -52,9 +52,8 @@ def classify_segments(data: ScanBeams) -> NDArray[np.int8]:
         data: M beams of 2D scans, in the order of their bearings.
     """
     scan = np.repeat(np.arange(len(data.offset) - 1), np.diff(data.offset))
-    usable = np.flatnonzero(
-        finite_rows(data.points) & ~find_lost_beams(data.hit, data.points, scan)
-    )
+    lost = find_lost_beams(data.hit, data.points, scan)
+    usable = np.flatnonzero(finite_rows(data.points) & ~lost)
     types = np.full(len(data.hit), -1, np.int8)
     if len(usable) == 0:
         return types

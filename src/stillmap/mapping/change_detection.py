@@ -145,9 +145,8 @@ def detect_changes(
         movers: end points on movers; of the changes in view only those near one are kept. None:
             all are.
     """
-    changed = histories.select(
-        (histories.p_changing > _MIN_PROBABILITY) & (histories.n_changes > 0)
-    )
+    is_changed = (histories.p_changing > _MIN_PROBABILITY) & (histories.n_changes > 0)
+    changed = histories.select(is_changed)
     unchanged = histories.unchanged_cells
     return group_changes(changed, unchanged, recording, resolution, time_bin, movers)
 
@@ -302,15 +301,9 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
         for k, larger in enumerate(out):
             small = change.kind == larger.kind and 2 * len(change.cells) <= len(larger.cells)
             if small and _within(larger.cells, change.cells, radius):
-                out[k] = _make_change(
-                    change.kind,
-                    np.unique(np.concatenate([larger.cells, change.cells]), axis=0),
-                    resolution,
-                    larger.before_ns,
-                    larger.stamp_ns,
-                    larger.last_ns,
-                    larger.times,
-                )
+                cells = np.unique(np.concatenate([larger.cells, change.cells]), axis=0)
+                times = (larger.before_ns, larger.stamp_ns, larger.last_ns, larger.times)
+                out[k] = _make_change(change.kind, cells, resolution, *times)
                 break
         else:
             out.append(change)

@@ -75,7 +75,7 @@ def find_changed_object_beams(
     doors are left out: they may be people who wait there.
     """
     stays = [
-        _Stay.from_change(change, changes)
+        _Stay.around_cells(change.cells, _stay_span(change, changes))
         for change in changes
         if change.kind != "comes and goes"
         or fit_sector(change.cells, change.resolution) is not None
@@ -103,10 +103,6 @@ class _Stay(NamedTuple):
     until: int
     low: Int64
     mask: Bool
-
-    @classmethod
-    def from_change(cls, change: Change, changes: list[Change]) -> "_Stay":
-        return cls.around_cells(change.cells, _stay_span(change, changes))
 
     @classmethod
     def around_cells(cls, cells: Int64, span: tuple[int, int]) -> "_Stay":

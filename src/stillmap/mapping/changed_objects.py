@@ -8,7 +8,7 @@ import numpy as np
 from stillmap import em
 from stillmap.core.array_types import Bool, Cells, Float, Float32, Index
 from stillmap.core.recording import Recording
-from stillmap.core.square_box import connected_components, neighbor_pairs
+from stillmap.core.square_box import cell_keys, connected_components, neighbor_pairs
 from stillmap.em import ChangedCells
 from stillmap.mapping.change_detection import Change, group_changes
 from stillmap.mapping.doors import is_row
@@ -133,11 +133,6 @@ def is_same_place(first: Change, second: Change) -> bool:
     return bool(np.mean(np.isin(cell_keys(smaller), cell_keys(larger))) > 0.5)
 
 
-def cell_keys(cells: Cells) -> Cells:
-    """(N,) one key per cell (N, 2); map coordinates stay far below 2 ** 31 cells."""
-    return np.asarray((cells[:, 0] << 32) + cells[:, 1], np.int64)
-
-
 _MIN_STAY = 12.0  # s: a shorter stay is a wait, a shorter absence an occlusion
 _MIN_HEIGHT = 0.4  # m: anything lower is ground observed along other beams
 _MIN_AREA = 0.7  # m2 of visible surface
@@ -208,12 +203,8 @@ def measure_dwell_times(
     key = np.ravel_multi_index(tuple((voxels - low).T), shape)
     limits = np.iinfo(np.int64)
     first, last = np.full(len(place), limits.max), np.full(len(place), limits.min)
-    since = np.array([change.stamp_ns if change.appeared else limits.min for change in places])[
-        place
-    ]
-    until = np.array([limits.max if change.appeared else change.before_ns for change in places])[
-        place
-    ]
+    since = np.array([change.stamp_ns if change.appeared else limits.min for change in places])
+    until = np.array([limits.max if change.appeared else change.before_ns for change in places])
     T_map_sensor = recording.T_map_sensor(poses)
     for t in recording.iter_scans(range(recording.n_scans)):
         stamp, beams, T = int(recording.stamp_ns[t]), recording.beams_of(t), T_map_sensor[t]
@@ -221,7 +212,7 @@ def measure_dwell_times(
         cells = np.floor((points @ T[:3, :3].T + T[:3, 3]) / resolution).astype(np.int64)
         inside = cells[((cells >= low) & (cells <= high)).all(axis=1)] - low
         was_hit = np.isin(key, np.ravel_multi_index(tuple(inside.T), shape))
-        was_hit &= (since <= stamp) & (stamp <= until)
+        was_hit &= ((since <= stamp) & (stamp <= until))[place]
         first[was_hit] = np.minimum(first[was_hit], stamp)
         last[was_hit] = np.maximum(last[was_hit], stamp)
     out = []

@@ -9,8 +9,8 @@ import numpy as np
 
 from stillmap.core.array_types import Cells, Float
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import cell_keys
 from stillmap.mapping.change_detection import Change
-from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door_states import is_passage_observed, observe_states
 from stillmap.mapping.doors import Door, Sector, fit_sector
 from stillmap.mapping.resting_leaf import find_resting_leaf
@@ -122,11 +122,9 @@ def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
             leaf = find_resting_leaf(cells, others, resolution)
             cells = np.unique(np.concatenate([cells, leaf]), axis=0)
             sector = fit_sector(cells, resolution) if len(leaf) else None
-        if (
-            sector is not None
-            and sector.length * resolution >= _MIN_LEAF
-            and _MIN_SWING <= sector.angle <= _MAX_SWING
-        ):
+        if sector is None or sector.length * resolution < _MIN_LEAF:
+            continue
+        if _MIN_SWING <= sector.angle <= _MAX_SWING:
             candidates.append(_Candidate(sector, group, cells, rests))
     return sorted(candidates, key=lambda candidate: (candidate.rests, -len(candidate.cells)))
 

@@ -8,8 +8,7 @@ import numpy as np
 from stillmap.core.array_types import Cells, Float, Index, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
-from stillmap.core.square_box import group_indices
-from stillmap.mapping.changed_objects import cell_keys
+from stillmap.core.square_box import cell_keys, group_indices
 from stillmap.mapping.doors import Door, DoorState, Position
 
 _BIN_NS = 10**9  # in which the cells that were hit make one observation

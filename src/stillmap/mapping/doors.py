@@ -115,11 +115,8 @@ def _fit_two_lines(cells: Cells) -> Sector | None:
         sector = Sector(hinge, cells)
         # cells beside the hinge of a wide swing fit as many cells with longer leaves
         score = (sector.inlier_share(cells), -sector.length)
-        if (
-            _MIN_ANGLE < sector.angle < _MAX_ANGLE
-            and score > best_score
-            and sector.covers_both_ends(cells)
-        ):
+        swings = _MIN_ANGLE < sector.angle < _MAX_ANGLE
+        if swings and score > best_score and sector.covers_both_ends(cells):
             best, best_score = sector, score
     return best
 

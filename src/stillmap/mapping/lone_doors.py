@@ -16,7 +16,7 @@ from stillmap.core import arrays
 from stillmap.core.array_types import Cells, Float, Float32, Index, Int64
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
-from stillmap.mapping.changed_objects import cell_keys
+from stillmap.core.square_box import cell_keys
 from stillmap.mapping.door_states import (
     INNER,
     find_hit_cells,
@@ -68,9 +68,8 @@ def compute_p_moved(
     for stamps, (_, gaps) in zip(observations, spans, strict=True):
         ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
         # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
-        log_still = -_RATES * ends - np.logaddexp(
-            np.outer(_RATES, gaps), -np.outer(_RATES, gaps)
-        ).sum(axis=1)
+        expected = np.outer(_RATES, gaps)  # swings within each gap
+        log_still = -_RATES * ends - np.logaddexp(expected, -expected).sum(axis=1)
         log_still += len(gaps) * math.log(2.0)
         moved.append(1.0 - float(posterior @ np.exp(log_still)))
     return np.array(same), np.array(moved)
@@ -88,9 +87,8 @@ def _log_likelihood_of_swings(door: Door) -> Float:
     Each state lasts from the first to the last time the leaf was seen so; it may have moved to and
     fro meanwhile.
     """
-    since, until = (
-        1e-9 * np.array([[state.since_ns, state.until_ns] for state in door.states], float).T
-    )
+    spans = np.array([[state.since_ns, state.until_ns] for state in door.states], float)
+    since, until = 1e-9 * spans.T
     between = np.maximum(since[1:] - until[:-1], _LEAST)
     differs = 0.5 * -np.expm1(-2.0 * np.outer(_RATES, between))
     same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, until - since)))
@@ -100,10 +98,8 @@ def _log_likelihood_of_swings(door: Door) -> Float:
 def _split_observations(stamps: Int64) -> tuple[float, Float]:
     """Seconds in which a leaf was watched, and the gaps between them."""
     pauses = 1e-9 * (stamps[1:, 0] - stamps[:-1, 1]).astype(np.float64)
-    watched = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum()) + float(
-        pauses[pauses <= _WATCHED].sum()
-    )
-    return watched, pauses[pauses > _WATCHED]
+    observed = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum())
+    return observed + float(pauses[pauses <= _WATCHED].sum()), pauses[pauses > _WATCHED]
 
 
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
@@ -138,22 +134,16 @@ def find_lone_doors(
     if not doorways:
         return []
     counts = _count_beams(recording, poses, resolution, threads)
-    left = [
-        (leaf, is_open)
-        for doorway in doorways
-        if is_doorway_free(doorway, counts)
-        for leaf, is_open in (
-            (find_open_leaf(doorway, surface), True),
-            (find_shut_leaf(doorway, surface), False),
-        )
-        if leaf is not None and len(leaf.cells)  # of coarse cells, all may be at the wall
-    ]
+    free = [doorway for doorway in doorways if is_doorway_free(doorway, counts)]
+    found = [(find_open_leaf(doorway, surface), True) for doorway in free]
+    found += [(find_shut_leaf(doorway, surface), False) for doorway in free]
     taken = [door.swept_cells for door in doors]
     leaves: list[tuple[LoneLeaf, bool]] = []
-    for leaf, is_open in sorted(left, key=lambda lone: not lone[1]):
-        if (not is_open or is_thin(leaf, counts)) and not any(
-            _is_part(leaf.cells, cells) for cells in taken
-        ):
+    for leaf, is_open in found:
+        if leaf is None or not len(leaf.cells):  # of coarse cells, all may be at the wall
+            continue
+        is_leaf = not is_open or is_thin(leaf, counts)
+        if is_leaf and not any(_is_part(leaf.cells, cells) for cells in taken):
             taken.append(leaf.cells)
             leaves.append((leaf, is_open))
     return _observe(leaves, doors, recording, poses, resolution)
@@ -198,10 +188,9 @@ def _observe(
         else:
             lone_doors.append(door)
             lone_observations.append(seen)
-    lone_doors = _rate_lone(
-        lone_doors, lone_observations, [*doors, *passed_doors], recording.stamp_ns
-    )
-    return [*passed_doors, *lone_doors]
+    swung = [*doors, *passed_doors]
+    rated = _rate_lone(lone_doors, lone_observations, swung, recording.stamp_ns)
+    return [*passed_doors, *rated]
 
 
 def _find_passages(
@@ -232,9 +221,8 @@ def _rate_lone(
     is_open = np.array([len(door.open_cells) > 0 for door in lone], bool)
     same, moved = compute_p_moved(swung, observations, stamp_ns)
     p_door = np.full(len(lone), _P_LEAF)
-    p_door[~is_open] = estimate_p_door(
-        estimate_shut_share(swung) * same[~is_open], len(swung) + int(is_open.sum())
-    )
+    p_shut = estimate_shut_share(swung) * same[~is_open]
+    p_door[~is_open] = estimate_p_door(p_shut, len(swung) + int(is_open.sum()))
     return [
         dataclasses.replace(lone[k], p_moved=float(moved[k] * p_door[k]))
         for k in np.flatnonzero(p_door >= _MIN_P_LISTED).tolist()

@@ -153,12 +153,8 @@ def _rate_leaves(
     if every is None or not len(every.hinge):
         return None
     across = every.leaf[:, ::-1] * [-1.0, 1.0]
-    aside = np.stack(
-        [
-            field.sample(field.is_surface, every.row + k * across[:, None])
-            for k in np.arange(-_ASIDE, _ASIDE + 1.0)
-        ]
-    )
+    rows = [every.row + k * across[:, None] for k in np.arange(-_ASIDE, _ASIDE + 1.0)]
+    aside = np.stack([field.sample(field.is_surface, row) for row in rows])
     best: tuple[float, LoneLeaf] | None = None
     for length in doorway.width + _LONGER:
         score = _score_leaves(every, aside, t, length)

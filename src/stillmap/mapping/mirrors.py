@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core.array_types import Bool, Cells, Float, Index
+from stillmap.core.square_box import cell_keys
 
 _MIN_HITS, _MIN_DYNAMIC_HITS = 2, 5  # in a cell with a surface; mirrors make some look dynamic
 _MAX_CELLS, _MAX_LINES = 10_000, 40
@@ -33,11 +34,11 @@ class SurfaceCells:
 
     def __init__(self, points: Float, is_static: Bool, resolution: float) -> None:
         """The cells in which several of the points (N, 2) lie, fewer if they are static (N,)."""
-        keys = cell_keys(np.floor(points / resolution).astype(np.int64))
+        cells = np.floor(points / resolution).astype(np.int64)
         weight = np.where(is_static, 1.0 / _MIN_HITS, 1.0 / _MIN_DYNAMIC_HITS)
-        own, number = np.unique(keys, return_inverse=True)
-        own = own[np.bincount(number, weights=weight, minlength=len(own)) > 1.0 - 1e-9]
-        self.cells = np.stack([own >> 32, (own & 0xFFFFFFFF) - (1 << 31)], axis=-1)
+        own, first, number = np.unique(cell_keys(cells), return_index=True, return_inverse=True)
+        enough = np.bincount(number, weights=weight, minlength=len(own)) > 1.0 - 1e-9
+        self.cells, own = cells[first[enough]], own[enough]
         around = [self.cells + np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         self.keys = np.unique(cell_keys(np.concatenate(around)))
         self.own_keys, self.resolution = own, resolution
@@ -56,11 +57,6 @@ def contains(keys: Cells, points: Float, resolution: float) -> Bool:
     wanted = cell_keys(np.floor(points / resolution).astype(np.int64))
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     return np.asarray(keys[at] == wanted) if len(keys) else np.zeros(wanted.shape, np.bool_)
-
-
-def cell_keys(cells: Cells) -> Cells:
-    """(...) a number for each cell (..., 2)."""
-    return np.asarray((cells[..., 0] << 32) + cells[..., 1] + (1 << 31))
 
 
 def iter_lines(cells: Cells, resolution: float) -> Iterator[tuple[Float, float]]:
@@ -249,10 +245,7 @@ def _back_hits(mirror: Mirror, beams: Beams, first: float, last: float) -> Index
 def _has_frame(mirror: Mirror, ends: Float) -> bool:
     """True if there is wall on both sides; else it may be the axis of a symmetric room."""
     on = ends[np.abs(ends @ mirror.normal - mirror.distance) < _ON_LINE] @ tangent_of(mirror.normal)
-    for low, high in (
-        (mirror.first - _FRAME, mirror.first),
-        (mirror.last, mirror.last + _FRAME),
-    ):
+    for low, high in ((mirror.first - _FRAME, mirror.first), (mirror.last, mirror.last + _FRAME)):
         hits = np.histogram(on, round(_FRAME / BIN), (low, high))[0]
         if np.count_nonzero(hits >= _MIN_FRAME_HITS) < _MIN_FILLED * len(hits):
             return False

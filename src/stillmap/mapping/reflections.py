@@ -150,11 +150,8 @@ def _find_runs(along: Float, fit: Bool) -> list[tuple[float, float]]:
         start = low + BIN * k
         last_bin = round((runs[-1][1] - low) / BIN) if runs else 0
         gap = slice(last_bin, k)  # what stands before a mirror hides parts of it
-        if (
-            runs
-            and k - last_bin <= _MAX_GAP / BIN
-            and (fitting[gap].sum() >= _MIN_GAP_SHARE * n[gap].sum())
-        ):
+        fits = fitting[gap].sum() >= _MIN_GAP_SHARE * n[gap].sum()
+        if runs and k - last_bin <= _MAX_GAP / BIN and fits:
             runs[-1][1] = start + BIN
         else:
             runs.append([start, start + BIN])

@@ -133,10 +133,8 @@ def _rate_leaves(
     for side in np.arange(-_ASIDE, _ASIDE + 1.0):
         is_end &= ~field.sample(field.is_surface, beyond + side * across).any(axis=1)
     far = leaf[:, t >= _NEAR_HINGE * length]
-    clear = 1.0 - np.max(
-        [field.sample(field.is_surface, far + k * across).mean(axis=1) for k in (-_ASIDE, _ASIDE)],
-        axis=0,
-    )
+    rows = [field.sample(field.is_surface, far + k * across) for k in (-_ASIDE, _ASIDE)]
+    clear = 1.0 - np.max([row.mean(axis=1) for row in rows], axis=0)
     good = is_end & (exactly >= _MIN_EXACT) & (clear >= _MIN_CLEAR)
     score = np.where(good, covered + exactly + clear, 0.0)
     best = int(score.argmax())

@@ -170,7 +170,6 @@ def _model_object(
     assignment, views = assign_object_views(shape, background, boxes, start)
     textured = bake(assignment.mesh, assignment.view, views)
     T = shape.frame.T_map_object(shape.seconds)
-    first, middle, last = (
-        start + round(1e9 * at) for at in (shape.span[0], shape.seconds, shape.span[1])
-    )
+    times = (shape.span[0], shape.seconds, shape.span[1])
+    first, middle, last = (start + round(1e9 * at) for at in times)
     return ObjectModel(shape, assignment, views, textured, T, middle, (first, last))

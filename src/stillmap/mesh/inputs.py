@@ -11,6 +11,7 @@ import numpy as np
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, max_scan_duration_ns
+from stillmap.core.segments import segments_meet_box
 from stillmap.em import GroundMap
 from stillmap.mesh.range_image import has_planar_scans
 from stillmap.tracking import MovingObject
@@ -37,6 +38,13 @@ class TrackedBox(NamedTuple):
     box: Box
     bottom: Float
     height: float
+
+    def pose_at(self, seconds: Float) -> tuple[Float, Float, Float]:
+        """Center (n, 2) metres, heading (n, 2) and height of the lower side (n,) at times (n,)."""
+        box = self.box
+        at = np.clip(np.searchsorted(box.seconds, seconds, side="right") - 1, 0, None)
+        bottom = np.interp(seconds, box.seconds, self.bottom)
+        return box.center_at(seconds), box.heading[at], bottom
 
     def motion_until(self, now: float, seconds: Float) -> Float:
         """(n, 2) metres by which the box moves from times (n,) to a time."""
@@ -105,23 +113,14 @@ class ObjectFrame(NamedTuple):
 
     def to_object(self, seconds: Float, points: Float) -> Float:
         """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
-        box = self.box.box
-        center = box.center_at(seconds)
-        heading = box.heading[np.clip(np.searchsorted(box.seconds, seconds, "right") - 1, 0, None)]
+        center, heading, bottom = self.box.pose_at(seconds)
         off = points[:, :2] - center
-        bottom = np.interp(seconds, box.seconds, self.box.bottom)
-        at = np.stack(
-            [
-                (off * heading).sum(axis=1),
-                off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1],
-                points[:, 2] - bottom,
-            ],
-            axis=1,
-        )
+        ahead = (off * heading).sum(axis=1)
+        left = off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1]
         dx, dy, turn = (np.interp(seconds, self.seconds, column) for column in self.offset.T)
         c, s = np.cos(turn), np.sin(turn)
-        x, y = c * at[:, 0] - s * at[:, 1] + dx, s * at[:, 0] + c * at[:, 1] + dy
-        return np.stack([x, y, at[:, 2]], axis=1)
+        x, y = c * ahead - s * left + dx, s * ahead + c * left + dy
+        return np.stack([x, y, points[:, 2] - bottom], axis=1)
 
     def T_map_object(self, seconds: float) -> Float:
         """(4, 4) pose of the object's frame at a time."""
@@ -157,14 +156,12 @@ class OrientedBox(NamedTuple):
 def boxes_at(boxes: Sequence[TrackedBox], seconds: float) -> list[OrientedBox]:
     """The boxes that exist at a time, in seconds of their tracks."""
     out = []
-    for box, bottom, height in boxes:
-        if max(box.seconds[0] - seconds, seconds - box.seconds[-1]) > box.hold:
-            continue
-        xy = box.center_at(np.array([seconds]))[0]
-        at = max(int(np.searchsorted(box.seconds, seconds, side="right")) - 1, 0)
-        low = float(np.interp(seconds, box.seconds, bottom))
-        center = np.array([*xy, low + 0.5 * height])
-        out.append(OrientedBox(center, box.heading[at], np.array([*box.half_size, 0.5 * height])))
+    for tracked in boxes:
+        box, half_height = tracked.box, 0.5 * tracked.height
+        if max(box.seconds[0] - seconds, seconds - box.seconds[-1]) <= box.hold:
+            (xy,), (heading,), (low,) = tracked.pose_at(np.array([seconds]))
+            center, half_size = [*xy, low + half_height], [*box.half_size, half_height]
+            out.append(OrientedBox(np.array(center), heading, np.array(half_size)))
     return out
 
 
@@ -185,7 +182,7 @@ def occlusion_probability(boxes: Sequence[OrientedBox], position: Float, points:
         shown = np.zeros(len(near))
         for growth in reversed(_GROWTHS):
             half_size = one.half_size + OUTLINE_MARGIN + growth * _OUTLINE_SIGMA
-            shown[intersects_box(start, ends, half_size)] = _P_IN_BOX * np.exp(-0.5 * growth**2)
+            shown[segments_meet_box(start, ends, half_size)] = _P_IN_BOX * np.exp(-0.5 * growth**2)
         free[near] *= 1.0 - shown
     return 1.0 - free
 
@@ -194,7 +191,7 @@ def is_in_or_behind_box(boxes: Sequence[OrientedBox], position: Float, points: F
     """(n,) whether the line of sight from a camera (3,) to points (n, 3) meets a box."""
     out = np.zeros(len(points), np.bool_)
     for one, near, start, ends in _sights_near_boxes(boxes, position, points, 0.0):
-        out[near] |= intersects_box(start, ends, one.half_size)
+        out[near] |= segments_meet_box(start, ends, one.half_size)
     return out
 
 
@@ -220,25 +217,6 @@ def squared_segment_distances(center: Float, along: Float, square: Float) -> Flo
     dot = center[0] * along[0] + center[1] * along[1] + center[2] * along[2]
     share = np.clip(dot / square, 0.0, 1.0)
     return np.asarray(center @ center + share * (share * square - 2.0 * dot))
-
-
-def intersects_box(start: Float, ends: Float, half_size: Float) -> Bool:
-    """(n,) whether segments from `start` (3,) to `ends` (n, 3) meet a box around the origin.
-
-    Slab test: a segment lies between each pair of faces over an interval of its length.
-    """
-    enters, leaves = np.full(len(ends), -np.inf), np.full(len(ends), np.inf)
-    for axis in range(3):
-        along = ends[:, axis] - start[axis]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one = (-half_size[axis] - start[axis]) / along
-            other = (half_size[axis] - start[axis]) / along
-        first, last = np.minimum(one, other), np.maximum(one, other)
-        # parallel to the faces: all of the segment lies between them, or nothing
-        beside = np.inf if abs(start[axis]) > half_size[axis] else -np.inf
-        first[along == 0.0], last[along == 0.0] = beside, -beside
-        enters, leaves = np.maximum(enters, first), np.minimum(leaves, last)
-    return np.asarray((enters <= leaves) & (leaves >= 0.0) & (enters <= 1.0))
 
 
 _SCANS_AROUND = 1  # before and after a time, whose beams may be of it
@@ -307,6 +285,14 @@ class MeshInputs:
         a = int(np.searchsorted(stamps, first - slack)) - _SCANS_AROUND
         b = int(np.searchsorted(stamps, last + slack, side="right")) + _SCANS_AROUND
         return slice(max(a, 0), min(b, len(stamps)))
+
+    def beams_within(self, first: float, last: float) -> tuple[Index, Float]:
+        """The beams (n,) between two times, and their times (n,)."""
+        scans, offset = self.scans_within(first, last), self.deskewed.offset
+        beams = np.arange(offset[scans.start], offset[scans.stop])
+        seconds = self.seconds_of(beams)
+        within = (seconds >= first) & (seconds <= last)
+        return beams[within], seconds[within]
 
     @cached_property
     def _beams_of_boxes(self) -> list[tuple[TrackedBox, Index]]:

@@ -86,11 +86,12 @@ def assign_object_views(
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
         all_pixels = find_visible_faces(mesh, moved)
         faces = np.flatnonzero(all_pixels)
-        inset = _OUTLINE_INSET + OUTLINE_DRIFT * (0.0 if shape.rigid else _travel(shape, now))
+        (travel,) = shape.frame.box.motion_until(now, np.array([shape.seconds]))
+        drift = 0.0 if shape.rigid else OUTLINE_DRIFT * float(np.linalg.norm(travel))
         corners = moved.to_camera(mesh.vertices)
         depth = np.zeros(len(corners))
         depth[corners[:, 2] > NEAR] = outline_depth(corners[corners[:, 2] > NEAR], _MAX_FACE_EDGE)
-        depth = depth[mesh.faces[faces]].min(axis=1, initial=np.inf) - inset
+        depth = depth[mesh.faces[faces]].min(axis=1, initial=np.inf) - (_OUTLINE_INSET + drift)
         points = mesh.centers[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
         kept = _shows_object(points, depth, number, background)
         faces, points = faces[kept], points[kept]
@@ -129,12 +130,6 @@ def _shows_object(points: Float, depth: Float, number: int, background: Backgrou
         return np.zeros_like(shown)
     shown[shown] = differs | (unknown & (depth[shown] >= _UNCERTAIN_INSET))
     return shown
-
-
-def _travel(shape: ObjectShape, seconds: float) -> float:
-    """Metres that an object moved between its observation and a time."""
-    at = shape.frame.box.box.center_at(np.array([shape.seconds, seconds]))
-    return float(np.linalg.norm(at[1] - at[0]))
 
 
 def outline_depth(points: Float, radius: float) -> Float:

@@ -64,11 +64,8 @@ def extract_partial_scan(
     """
     inputs, around = returns.inputs, _CONTEXT if fast else 0.0
     first, last = span[0] - around, span[1] + around
-    scans, deskewed = inputs.scans_within(first, last), inputs.deskewed
-    beams = np.arange(deskewed.offset[scans.start], deskewed.offset[scans.stop])
-    seconds = inputs.seconds_of(beams)
-    then = (seconds >= first) & (seconds <= last)
-    beams, seconds = beams[then], seconds[then]
+    deskewed = inputs.deskewed
+    beams, seconds = inputs.beams_within(first, last)
     origin = inputs.T_map_sensor[deskewed.scans_of(beams), :3, 3]
     mine = within_time(own, returns.seconds, first, last)
     if fast:
@@ -147,9 +144,8 @@ def _is_grazing(spans: Float, edges: Float, sight: Float, limit: float, max_dept
     sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
     deep = np.abs(np.einsum("nki,ni->nk", spans, sight))
     across = np.sqrt(np.maximum(edges**2 - deep**2, 0.0)).max(axis=1)
-    return np.asarray(
-        (across <= limit) & (deep.max(axis=1) <= np.minimum(max_depth, _MAX_STEEPNESS * across))
-    )
+    max_depths = np.minimum(max_depth, _MAX_STEEPNESS * across)
+    return np.asarray((across <= limit) & (deep.max(axis=1) <= max_depths))
 
 
 def _project_perspective(sensor: Float, center: Float, points: Float) -> tuple[Float, Bool]:
@@ -366,8 +362,6 @@ def _correspondences(
 
 def surface_distance(one: PartialSurface, known: PartialSurface) -> float:
     """Metres, third quartile of a surface's distances from another; NaN: too little in common."""
-    if not len(known.mesh.vertices):
-        return float("nan")
     residual = _correspondences(one.sample(_POINTS), known, _RADII[0])[2]
     if len(residual) < _MIN_POINTS:
         return float("nan")

@@ -198,19 +198,16 @@ class Background:
             ok &= is_in_image(self.views[other].camera, there)
             some, there = some[ok], there[ok]
             shown = sample_bilinear(self.image(number), here[some])
-            off = [
-                np.linalg.norm(shown - sample_bilinear(image, there + d), axis=1) for d in _SHIFTS
-            ]
+            known = [sample_bilinear(image, there + shift) for shift in _SHIFTS]
+            off = [np.linalg.norm(shown - color, axis=1) for color in known]
             out[some] = np.min(off, axis=0)
         return out
 
     def _render(self, number: int) -> DepthBuffer:
         """A small z-buffer of all that a view shows."""
         view = self.views[number]
-        across, down = np.meshgrid(
-            np.linspace(0, view.camera.width - 1, _BORDER_RAYS),
-            np.linspace(0, view.camera.height - 1, _BORDER_RAYS),
-        )
+        size = (view.camera.width, view.camera.height)
+        across, down = np.meshgrid(*(np.linspace(0, edge - 1, _BORDER_RAYS) for edge in size))
         shown = unproject(view.camera, np.column_stack([across.ravel(), down.ravel()]))
         shown = shown[np.isfinite(shown).all(axis=1)]
         scale = min(_BUFFER_WIDTH / view.camera.width, DEPTH_SCALE)
@@ -218,10 +215,8 @@ class Background:
 
 
 def sample_buffer(values: NDArray[np.generic], buffer: DepthBuffer, at: Float) -> Float:
-    """(...,) values of an image (h, w) of a z-buffer at points (..., 3) in the camera's frame."""
+    """(n,) values of an image (h, w) of a z-buffer at points (n, 3) in the camera's frame."""
     h, w = values.shape
-    column, row = (
-        np.rint(a).astype(np.intp) for a in project_pinhole(buffer.K, at.reshape(-1, 3).T)
-    )
+    column, row = (np.rint(a).astype(np.intp) for a in project_pinhole(buffer.K, at.T))
     found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
-    return np.asarray(found.reshape(at.shape[:-1]), np.float64)
+    return np.asarray(found, np.float64)

@@ -131,12 +131,6 @@ def has_planar_scans(recording: Recording) -> bool:
     return sum(planar) * 2 > len(planar)
 
 
-def is_row_scanner(recording: Recording) -> bool:
-    """True if scans are planar and of one length, so that each is a row of a range image."""
-    counts = np.diff(recording.offset)
-    return has_planar_scans(recording) and len(np.unique(counts[counts > 0])) == 1
-
-
 def median_angle(one: Float, other: Float) -> float:
     """rad, median angle between directions (n, 3) and (n, 3); NaN where no pair is known."""
     chord = np.linalg.norm(one - other, axis=1)
@@ -152,7 +146,8 @@ def find_scan_layout(recording: Recording, chosen: Index) -> ScanLayout:
         chosen: scans to be used; where scans are rows, all are.
     """
     counts = np.diff(recording.offset)
-    if is_row_scanner(recording):
+    # planar scans of one length are rows of range images
+    if has_planar_scans(recording) and len(np.unique(counts[counts > 0])) == 1:
         return ScanLayout(True, _split_sequences(recording))
     return ScanLayout(False, [np.array([t]) for t in chosen if counts[t]])
 

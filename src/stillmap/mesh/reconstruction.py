@@ -179,14 +179,12 @@ def _mean_p_dynamic(
     low = fine.vertices.min(axis=0) - _POINT_DISTANCE
     high = fine.vertices.max(axis=0) + _POINT_DISTANCE
     low[2] = max(low[2], _MIN_RETURN_HEIGHT)
-    scans, offset = inputs.scans_within(*span), deskewed.offset
-    beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = inputs.seconds_of(beams)
-    then = (seconds >= span[0]) & (seconds <= span[1]) & deskewed.hit[beams]
-    at = frame.to_object(seconds[then], deskewed.end_points(beams[then], inputs.poses))
+    beams, seconds = inputs.beams_within(*span)
+    hit = deskewed.hit[beams]
+    at = frame.to_object(seconds[hit], deskewed.end_points(beams[hit], inputs.poses))
     some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
     distance = tree.query(at[some], distance_upper_bound=_POINT_DISTANCE)[0]
-    near = inputs.p_static[beams[then][some[np.isfinite(distance)]]]
+    near = inputs.p_static[beams[hit][some[np.isfinite(distance)]]]
     return 1.0 - float(near.mean(dtype=np.float64)) if len(near) else float("nan")
 
 
@@ -202,11 +200,8 @@ def _merge_partial_scans(
     best = int(np.argmin([abs(surface.time_offset) for surface in surfaces]))
     motion = register_surfaces(surfaces, best)
     moved = [surface.transform(motion) for surface in surfaces]
-    kept = [
-        k
-        for k, surface in enumerate(moved)
-        if k == best or surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET
-    ]
+    fits = [surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET for surface in moved]
+    kept = [k for k, is_near in enumerate(fits) if is_near or k == best]
     if len(kept) < max(2.0, _MIN_KEPT_SHARE * len(surfaces)):
         return None
     mesh = _fuse_patches([moved[k].to_patch() for k in kept])
@@ -240,15 +235,15 @@ def _partial_scans(
 
 def _make_surface(scan: PartialScan, now: float) -> PartialSurface:
     mesh = triangulate_partial_scan(scan, True, _MERGE_DEPTH)
-    return PartialSurface.from_mesh(
-        mesh, scan.origin[scan.own].mean(axis=0), 0.5 * sum(scan.span) - now
-    )
+    sensor = scan.origin[scan.own].mean(axis=0)
+    return PartialSurface.from_mesh(mesh, sensor, 0.5 * sum(scan.span) - now)
 
 
 def _fuse_patches(patches: Sequence[Patch]) -> Mesh:
     """One surface of several partial surfaces, by TSDF integration."""
     return integrate_patches(
         [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches],
+        len(patches),
         object_voxel_size(patches),
         truncation=_TRUNCATION,
         min_weight=min(_MIN_VIEWS, _MIN_VIEW_SHARE * len(patches)),
@@ -268,15 +263,14 @@ def object_voxel_size(patches: Sequence[Patch]) -> float:
 def straighten_track(tracked: TrackedBox, now: float, window: float) -> TrackedBox:
     """The box with the constant velocity that it has at a time, `window` seconds around it."""
     box = tracked.box
+    center, heading, bottom = tracked.pose_at(np.array([now]))
     seconds = np.array([now - window, now + window])
     velocity = np.array([np.interp(now, box.seconds, column) for column in box.velocity.T])
-    at = int(np.clip(np.searchsorted(box.seconds, now, side="right") - 1, 0, None))
     straight = dataclasses.replace(
         box,
         seconds=seconds,
-        xy=box.center_at(np.array([now])) + (seconds - now)[:, None] * velocity,
-        heading=np.tile(box.heading[at], (2, 1)),
+        xy=center + (seconds - now)[:, None] * velocity,
+        heading=np.tile(heading, (2, 1)),
         velocity=np.tile(velocity, (2, 1)),
     )
-    bottom = np.full(2, np.interp(now, box.seconds, tracked.bottom))
-    return TrackedBox(straight, bottom, tracked.height)
+    return TrackedBox(straight, np.tile(bottom, 2), tracked.height)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -191,8 +190,8 @@ def _run_xatlas(
     chart[page < 0] = chart.max() + 1
     texels = at.astype(np.float64) * np.array([atlas.width, atlas.height])
     # charts are as they were, shifted by whole texels, so that at scale 1 texels are pixels
-    local, corner_of = uv[vertex], partial(_chart_corners, chart=chart)
-    shift = np.rint(corner_of(texels) - 0.5) - np.floor(corner_of(local))
+    local = uv[vertex]
+    shift = np.rint(_chart_corners(texels, chart) - 0.5) - np.floor(_chart_corners(local, chart))
     return vertex.astype(np.intp), faces.astype(np.int32), local + shift[chart], page
 
 
@@ -252,7 +251,7 @@ def _bake_view(
 ) -> None:
     """Bakes the faces of the view with a number, page by page."""
     level = max(round(np.log2(1.0 / layout.scale[number])), 0)
-    smaller = downsample(image, level)
+    smaller = np.asarray(PIL.Image.fromarray(image).reduce(2**level))
     of_view = layout.view == number
     for page in np.unique(layout.page[of_view]).tolist():
         corners = layout.faces[of_view & (layout.page == page)]
@@ -288,11 +287,6 @@ def fill_gutters(page: Image, filled: Bool, gutter: int) -> None:
     page[row, column] = page[nearest[0][row, column], nearest[1][row, column]]
     filled[row, column] = True
     page[~filled] = mean
-
-
-def downsample(image: Image, times: int) -> Image:
-    """(h / 2^times, w / 2^times, 3) means of squares."""
-    return np.asarray(PIL.Image.fromarray(image).reduce(2**times))
 
 
 def sample_bilinear(image: NDArray[np.generic], uv: Float) -> Float32:

@@ -63,7 +63,7 @@ class Mesh(ShortRepr):
 
     def _cross_products(self) -> Float:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        return np.ascontiguousarray(cross_columns((b - a).T, (c - a).T).T)
+        return np.cross(b - a, c - a)
 
     def adjacent_faces(self) -> Int32:
         """(N, 2) pairs of faces that share an edge, if no third face does."""
@@ -103,13 +103,6 @@ def remove_small_components(mesh: Mesh, min_area: float) -> Mesh:
     component = component_labels(pairs, len(mesh.vertices))
     of_face = component[mesh.faces[:, 0]]
     return mesh.select(np.bincount(of_face, mesh.areas())[of_face] >= min_area)
-
-
-def cross_columns(a: Float, b: Float) -> Float:
-    """(3, n) cross products of vectors (3, n): operations on long rows are fast."""
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
 
 
 def dot_columns(a: Float, b: Float) -> Float:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core.array_types import Bool, Float, Index, Int32
-from stillmap.mesh.triangle_mesh import cross_columns, dot_columns, normalize_columns, row_lengths
+from stillmap.mesh.triangle_mesh import dot_columns, normalize_columns, row_lengths
 
 _MAX_EDGE = 1.5  # m: longer edges span holes
 _MAX_EDGE_SHARE = 0.15  # of the range, likewise
@@ -97,7 +97,7 @@ def filter_faces(points: Float, origin: Float, faces: Int32) -> tuple[Int32, Flo
     columns, corners = _columns(points), [np.ascontiguousarray(k) for k in faces.T]
     a, b, c = (columns[:, k] for k in corners)
     ab, bc, ca = b - a, c - b, a - c
-    cross, sight = cross_columns(ca, ab), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
+    cross, sight = np.cross(ca, ab, axis=0), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
     area, range = np.sqrt(dot_columns(cross, cross)), np.sqrt(dot_columns(sight, sight))
     longest = np.sqrt(np.max([dot_columns(edge, edge) for edge in (ab, bc, ca)], axis=0))
     facing = dot_columns(cross, sight)
@@ -105,7 +105,8 @@ def filter_faces(points: Float, origin: Float, faces: Int32) -> tuple[Int32, Flo
     away = facing < 0.0
     faces = np.where(away[:, None], faces[:, ::-1], faces)
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
-    level = has_equal_ranges(row_lengths(origin - points), faces)
+    ranges = row_lengths(origin - points)
+    level = np.ptp(ranges[faces.T], axis=0) <= _MAX_NOISE_RATIO * range_std(ranges, faces)
     limit = np.minimum(_MAX_EDGE, _MAX_EDGE_SHARE * range)
     kept = (longest <= limit) & (level | (cosine >= np.cos(_MAX_INCIDENCE))) & (area > 0.0)
     faces, cosine = faces[kept], cosine[kept]
@@ -120,17 +121,6 @@ def filter_faces(points: Float, origin: Float, faces: Int32) -> tuple[Int32, Flo
     smooth = vertex_normals(normals, faces, len(points), SMOOTHING_ROUNDS)
     standoff = dot_columns(smooth, _columns(origin - points))
     return faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0)
-
-
-def has_equal_ranges(range: Float, faces: Int32) -> Bool:
-    """(m,) whether the corners of triangles are equally distant up to noise.
-
-    Args:
-        range: (n,) metres.
-        faces: (m, 3).
-    """
-    between = np.ptp(range[faces.T], axis=0)
-    return np.asarray(between <= _MAX_NOISE_RATIO * range_std(range, faces))
 
 
 def range_std(range: Float, faces: Int32) -> float:

@@ -86,10 +86,7 @@ def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
 
 
 def choose_resolution(
-    recording: Recording,
-    poses: Float,
-    layout: ScanLayout,
-    voxel_size: float | None = None,
+    recording: Recording, poses: Float, layout: ScanLayout, voxel_size: float | None
 ) -> tuple[float, int]:
     """The edge of a voxel in metres, and the stride of rows and columns of range images.
 
@@ -151,7 +148,7 @@ def build_surface(
     recording: Recording,
     poses: Float,
     p_static: Float32,
-    options: MeshOptions | None = None,
+    options: MeshOptions,
     threads: int = 1,
     tell: Tell = no_tell,
 ) -> Mesh:
@@ -165,7 +162,6 @@ def build_surface(
         threads: same result with any number.
         tell: called with the work done and the total.
     """
-    options = options or MeshOptions()
     T = recording.T_map_sensor(poses)
     chosen = select_scans(T, recording.sensor, median_range(recording))
     layout = find_scan_layout(recording, chosen)
@@ -177,22 +173,15 @@ def build_surface(
         patch = make()
         return patch, static_weights(patch, p_static)
 
-    def patches() -> Iterable[tuple[Patch, Float32]]:
-        made = map_ordered(weighted, triangulate_scans(recording, poses, layout), threads)
-        for done, one in enumerate(made, start=1):
-            yield one
-            tell(done, 2 * n)
-
-    def tell_later(done: int, total: int) -> None:
-        tell(n + n * done // total, 2 * n)
-
+    patches = map_ordered(weighted, triangulate_scans(recording, poses, layout), threads)
     return integrate_patches(
-        patches(), voxel, max_faces=options.max_faces, threads=threads, tell=tell_later
+        patches, n, voxel, max_faces=options.max_faces, threads=threads, tell=tell
     )
 
 
 def integrate_patches(
     patches: Iterable[tuple[Patch, Float32]],
+    n: int,
     voxel: float,
     *,
     truncation: tuple[float, float] = _TRUNCATION,
@@ -206,26 +195,27 @@ def integrate_patches(
 
     Args:
         patches: each with the weights (m,) of its faces; those of weight 0 are left out.
+        n: number of patches.
         voxel: edge in metres.
         truncation: voxels in front of and behind a surface in which distances are stored.
         min_weight: voxels need more weight than this.
         min_area: square metres; smaller connected components are dropped.
         max_faces: triangle budget.
         threads: same result with any number.
-        tell: called with the tiles done and the total, after integration.
+        tell: called with the work done and the total.
     """
     front, back = (voxel * share for share in truncation)
     volume = _core.TsdfVolume(voxel, truncation_front=front, truncation_back=back)
-    for patch, weight in patches:
-        volume.integrate(
-            patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
-        )
+    for done, (patch, weight) in enumerate(patches, start=1):
+        at = (patch.points, patch.origin, patch.standoff)
+        volume.integrate(*at, patch.faces, weight, threads=threads)
+        tell(done, 2 * n)
     error = simplification_error(voxel)
     tiles, _ = unique_cells(volume.blocks() // (TILE // volume.block_edge))
     parts = list[Mesh]()
     for done, tile in enumerate(tiles, start=1):
         parts.append(simplify(extract_tile(volume, tile, min_weight), error))
-        tell(done, len(tiles))
+        tell(n + n * done // len(tiles), 2 * n)
     del volume  # frees the voxels before the mesh grows
     mesh = remove_small_components(weld(concatenate_meshes(parts)), min_area)
     return simplify_to_budget(simplify(mesh, error), error, max_faces)
@@ -263,9 +253,8 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     # scikit-image tests the mask at the last corner of a cube
     mask = np.zeros(metres.shape, np.bool_)
     mask[1:, 1:, 1:] = cubes
-    found, faces, _, _ = measure.marching_cubes(
-        np.where(known, metres, np.float32(1.0)), 0.0, mask=mask, gradient_direction="ascent"
-    )
+    values = np.where(known, metres, np.float32(1.0))
+    found, faces, *_ = measure.marching_cubes(values, 0.0, mask=mask, gradient_direction="ascent")
     vertices = found[:, ::-1].astype(np.float64) + first
     mesh = weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
     # vertices are counted from the center of voxel 0

@@ -225,16 +225,15 @@ def _log_ratios(view: Int32, colors: Float32) -> tuple[Int32, Int32, Float32]:
     the second to the first; of each face's best with all others, and of neighbors in rank."""
     with np.errstate(invalid="ignore"):
         usable = ((colors >= _DARK) & (colors <= _BRIGHT)).all(axis=2) & (view >= 0)
-    K = view.shape[1]
-    ones, others, ratios = [view[:0, 0]], [view[:0, 0]], [colors[:0, 0]]
-    for a, b in sorted({(0, k) for k in range(1, K)} | {(k - 1, k) for k in range(1, K)}):
-        face = np.flatnonzero(usable[:, a] & usable[:, b])
-        low, high = view[face, a], view[face, b]
-        brighter = np.log(colors[face, b] / colors[face, a])
-        ones.append(np.minimum(low, high))
-        others.append(np.maximum(low, high))
-        ratios.append(np.where((low < high)[:, None], brighter, -brighter))
-    return np.concatenate(ones), np.concatenate(others), np.concatenate(ratios)
+    later = range(1, view.shape[1])
+    ranks = np.array(sorted({(0, k) for k in later} | {(k - 1, k) for k in later}), np.intp)
+    first, second = ranks.reshape(-1, 2).T
+    pair, face = np.nonzero((usable[:, first] & usable[:, second]).T)
+    a, b = first[pair], second[pair]
+    one, other = view[face, a], view[face, b]
+    brighter = np.log(colors[face, b] / colors[face, a])
+    ratio = np.where((one < other)[:, None], brighter, -brighter)
+    return np.minimum(one, other), np.maximum(one, other), ratio
 
 
 def read_with_gains(images: Images, views: Sequence[View], gains: Float) -> Callable[[View], Image]:

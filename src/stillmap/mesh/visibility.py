@@ -23,14 +23,9 @@ _RELATIVE_TOLERANCE = 0.005  # m more per metre of distance
 _SLOPE_TOLERANCE = 0.05  # m per metre of distance, at most, for slanted faces
 _DILATION = 1  # pixels around a face in which much nearer depth occludes it: poses are inexact
 
-
-# weights of the corners at the samples of a face: center, near corners, near middles of edges
-_SAMPLES = (
-    np.array(
-        [[3, 3, 3], [7, 1, 1], [1, 7, 1], [1, 1, 7], [4, 4, 1], [1, 4, 4], [4, 1, 4]], np.float64
-    )
-    / 9.0
-)
+# ninths, weights of the corners at the samples of a face: center, near corners, near edges' middles
+_NINTHS = (3, 3, 3), (7, 1, 1), (1, 7, 1), (1, 1, 7), (4, 4, 1), (1, 4, 4), (4, 1, 4)
+_SAMPLES = np.array(_NINTHS, np.float64) / 9.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +102,9 @@ def render_depth(mesh: Mesh, view: View, shown: Float, scale: float) -> DepthBuf
     high = np.ceil(np.minimum(at.max(axis=0), middle + most)) + 2.0
     K[:2, 2] -= low
     width, height = (int(size) for size in np.maximum(high - low + 1.0, 1.0))
-    depth, face = _core.render_z_buffer(
-        np.ascontiguousarray(mesh.vertices),
-        np.ascontiguousarray(mesh.faces),
-        K,
-        np.ascontiguousarray(view.T_camera_map, np.float64),
-        width,
-        height,
-        near=NEAR,
-    )
+    vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+    T = np.ascontiguousarray(view.T_camera_map, np.float64)
+    depth, face = _core.render_z_buffer(vertices, faces, K, T, width, height, near=NEAR)
     return DepthBuffer(K, depth, face)
 
 
@@ -163,9 +152,8 @@ def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, norm
     here = allowed + np.minimum(0.5 * rise, _SLOPE_TOLERANCE * z)
     # neighboring faces may be steeper
     beside = allowed + np.minimum((2 * _DILATION + 1) * rise, 2.0 * _SLOPE_TOLERANCE * z)
-    return np.asarray(
-        inside & (z <= buffer.depth.ravel()[at] + here) & (z <= around.ravel()[at] + beside)
-    )
+    passes = (z <= buffer.depth.ravel()[at] + here) & (z <= around.ravel()[at] + beside)
+    return np.asarray(inside & passes)
 
 
 _COLUMNS = 80  # cells over the width of an image
@@ -236,9 +224,8 @@ def build_occlusion_mask(view: View, points: Float, p_static: Float32) -> Occlus
     row, column, away, p_dynamic = row[movers], column[movers], away[movers], p_dynamic[movers]
     radius = (OUTLINE_MARGIN / away + _BEAM_DIVERGENCE) * (float(camera.K[0, 0]) / size)
     nearest = _nearest_discs(row, column, np.ceil(np.minimum(radius, _MAX_RADIUS) - 0.5), shape)
-    return OcclusionMask(
-        size, np.append(away, np.inf)[nearest], np.append(p_dynamic, 0.0)[nearest], support
-    )
+    depth, dynamic = np.append(away, np.inf)[nearest], np.append(p_dynamic, 0.0)[nearest]
+    return OcclusionMask(size, depth, dynamic, support)
 
 
 def _nearest_discs(row: Index, column: Index, radius: Float, shape: tuple[int, int]) -> Index:

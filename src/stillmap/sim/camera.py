@@ -41,24 +41,6 @@ _SKIN, _HAIR, _SHOE = (222, 172, 140), (70, 46, 30), (40, 34, 30)
 _ZENITH, _HORIZON = np.array((120, 170, 232.0)), np.array((206, 226, 244.0))
 
 
-class SurfacePoints(NamedTuple):
-    """Points on one part of a mover.
-
-    Attributes:
-        mover: its number.
-        form, half, z: of the part, see Solids.
-        local: (n, 3) metres ahead and to the left of the part's center, and above its foot.
-        seed: see `compute_static_color`.
-    """
-
-    mover: int
-    form: int
-    half: Float
-    z: Float
-    local: Float
-    seed: int
-
-
 def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) -> Color:
     """(n, 3) RGB of static surfaces at points (n, 3) in the world.
 
@@ -72,14 +54,12 @@ def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) ->
     blur = np.broadcast_to(blur, x.shape)
     tile = _hash(np.floor(q / _TILE), seed)
     base = np.where((z > _FLOOR)[:, None], _WALLS[tile % 16], _FLOORS[tile % 8])
-    drift = np.stack(
-        [np.sin(0.9 * x + 0.5 * y + k) + np.sin(0.6 * y - 0.7 * x + 2 * k) for k in range(3)], 1
-    )
+    waves = [np.sin(0.9 * x + 0.5 * y + k) + np.sin(0.6 * y - 0.7 * x + 2 * k) for k in range(3)]
     chip = _hash(np.floor(q / _CHIP), seed + 1)
     light = _CHIPS * ((chip & 255) / 127.5 - 1.0) * _contrast(blur, _CHIP)
     along = np.where(tile & 256, q[:, 0] + q[:, 1], q[:, 1] - q[:, 2])
     light += _STRIPES * np.sin(2 * np.pi / _STRIPE * along) * _contrast(blur, _STRIPE)
-    colour = base * (1.0 + light[:, None] + _DRIFT / 2 * drift)
+    colour = base * (1.0 + light[:, None] + _DRIFT / 2 * np.stack(waves, 1))
     return _to_uint8(colour)
 
 
@@ -89,9 +69,13 @@ def compute_sky_color(direction: Float) -> Color:
     return _to_uint8(_HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up))
 
 
-def _person(spot: SurfacePoints) -> Float:
-    mover, form, half, z, p, seed = spot
-    u, v, w = p.T
+# colors of a part of a mover at points (n, 3), metres ahead and to the left of the part's center,
+# and above its foot; `seed` as for `compute_static_color`
+
+
+def _person(part: Solids, points: Float, seed: int) -> Float:
+    _, (form,), (half,), (z,), (mover,) = part
+    u, v, w = points.T
     around = np.arctan2(v / half[1], u / half[0])
     if form == ELLIPSOID:
         up = (w - z[0]) / (z[1] - z[0])
@@ -110,9 +94,9 @@ def _person(spot: SurfacePoints) -> Float:
     return np.where(belt, _SHOE, np.where(checked[:, None], shirt, trousers))
 
 
-def _vehicle(spot: SurfacePoints) -> Float:
-    mover, form, half, z, p, seed = spot
-    u, v, w = p.T
+def _vehicle(part: Solids, points: Float, seed: int) -> Float:
+    _, (form,), (half,), (z,), (mover,) = part
+    u, v, w = points.T
     paint = _pick_colors(_CARS, mover, seed)[0]
     if form == BOX and half[0] <= 0.31 and z[0] <= 0.0:  # a wheel
         r = np.hypot(u, w - z[1] / 2)
@@ -131,16 +115,16 @@ def _vehicle(spot: SurfacePoints) -> Float:
     return np.where((lamp & (u < 0))[:, None], (200.0, 16.0, 20.0), colour)
 
 
-def _door(spot: SurfacePoints) -> Float:
-    u, _, w = spot.local.T
+def _door(_part: Solids, points: Float, _seed: int) -> Float:
+    u, _, w = points.T
     wood = np.array((150, 92, 48.0)) * (1.0 + 0.12 * np.sin(40 * u + 3 * np.sin(5 * w)))[:, None]
     panel = (np.abs(np.abs(u) - 0.25) < 0.16) & (np.abs(w % 0.9 - 0.45) < 0.3)
     return np.asarray(np.where(panel[:, None], 0.75 * wood, wood))
 
 
-def _thing(spot: SurfacePoints) -> Float:
-    light, dark = _pick_colors(_CLOTHES, spot.mover, spot.seed)
-    squares = np.floor(spot.local / 0.15 + 0.01).astype(np.int64).sum(axis=1)
+def _thing(part: Solids, points: Float, seed: int) -> Float:
+    light, dark = _pick_colors(_CLOTHES, part.mover[0], seed)
+    squares = np.floor(points / 0.15 + 0.01).astype(np.int64).sum(axis=1)
     return np.where((squares % 2 == 0)[:, None], light, 0.7 * light + 0.3 * dark)
 
 
@@ -298,11 +282,9 @@ class CameraSimulator:
         color[static] = compute_static_color(places, self.colour_seed, blur)
         kinds = self._world.episode.motion.kinds
         for k in np.unique(part[part >= 0]).tolist():
-            pixels, mover = part == k, int(moving.mover[k])
+            pixels, paint = part == k, _PAINTS.get(kinds[moving.mover[k]], _vehicle)
             p = to_local(at + range[pixels][:, None] * direction[pixels], moving.pose[0, k])
-            form, half, z = int(moving.form[k]), moving.half[k], moving.z[k]
-            spot = SurfacePoints(mover, form, half, z, p, self.colour_seed)
-            color[pixels] = _to_uint8(_PAINTS.get(kinds[mover], _vehicle)(spot))
+            color[pixels] = _to_uint8(paint(moving.select(np.array([k])), p, self.colour_seed))
         return color
 
     def _expose(self, color: Color, image: int) -> Color:
@@ -310,9 +292,7 @@ class CameraSimulator:
         rng = np.random.default_rng((self.colour_seed, image))
         o = self._options
         gain = np.exp(o.exposure * rng.standard_normal())
-        noise = o.noise * rng.standard_normal(color.shape, dtype=np.float32)
-        out: Color = np.clip(np.rint(gain * color + noise), 0, 255).astype(np.uint8)
-        return out
+        return _to_uint8(gain * color + o.noise * rng.standard_normal(color.shape, np.float32))
 
 
 def _to_rays(direction: Float, at: Float) -> Rays:

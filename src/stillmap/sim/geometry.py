@@ -245,9 +245,8 @@ def make_vehicle(length: float, width: float, kind: str) -> list[Part]:
     if kind == "forklift":
         return _forklift(length, width)
     half = width / 2
-    wheels = [
-        Part(BOX, i * 0.31 * length, j * (half - 0.12), (0.3, 0.1), (0.0, 0.6)) for i, j in _CORNERS
-    ]
+    wheel = (0.3, 0.1), (0.0, 0.6)
+    wheels = [Part(BOX, i * 0.31 * length, j * (half - 0.12), *wheel) for i, j in _CORNERS]
     if length > VAN:
         body = Part(BOX, 0.0, 0.0, (length / 2, half), (0.3, 1.1))
         return [body, Part(BOX, -0.09 * length, 0.0, (0.41 * length, half), (1.1, 2.1)), *wheels]
@@ -261,10 +260,8 @@ def _forklift(length: float, width: float) -> list[Part]:
     mast = Part(BOX, 0.19 * length, 0.0, (0.04 * length, 0.7 * half), (0.05, 2.2))
     forks = [Part(BOX, 0.36 * length, j * 0.3, (0.14 * length, 0.06), (0.04, 0.1)) for j in (-1, 1)]
     roof = Part(BOX, rear, 0.0, (0.2 * length, 0.85 * half), (2.05, 2.12))
-    posts = [
-        Part(CYLINDER, rear + i * 0.18 * length, j * 0.75 * half, (0.03, 0.03), (1.1, 2.05))
-        for i, j in _CORNERS
-    ]
+    at = [(rear + i * 0.18 * length, j * 0.75 * half) for i, j in _CORNERS]
+    posts = [Part(CYLINDER, *xy, (0.03, 0.03), (1.1, 2.05)) for xy in at]
     body = Part(BOX, rear, 0.0, (0.33 * length, half), (0.1, 1.1))
     return [body, mast, roof, *forks, *posts]
 

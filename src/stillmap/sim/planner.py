@@ -40,26 +40,25 @@ class FreeSpace:
         self.origin = ends.min(axis=0) - _MARGIN
         size = np.ceil((ends.max(axis=0) + _MARGIN - self.origin) / SPACING).astype(int) + 1
         self.clearance: Float = np.full((size[1], size[0]), _MAX_CLEARANCE)
-        for wall in walls:
-            self._add_wall(wall)
+        self._add_walls(walls)
 
     def with_walls(self, walls: Float) -> "FreeSpace":
         """The free space between these walls (W, 4), within the same bounds, and its own."""
         more = copy.copy(self)
         more.clearance = self.clearance.copy()
-        for wall in walls:
-            more._add_wall(wall)
+        more._add_walls(walls)
         return more
 
-    def _add_wall(self, wall: Float) -> None:
-        ends = wall.reshape(2, 2)
-        low = (ends.min(axis=0) - _MAX_CLEARANCE - self.origin) / SPACING
-        high = (ends.max(axis=0) + _MAX_CLEARANCE - self.origin) / SPACING
-        (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int) + 2
-        window = self.clearance[y0:y1, x0:x1]
-        rows, columns = np.indices(window.shape)
-        nodes = self.origin + np.stack([columns + x0, rows + y0], axis=-1) * SPACING
-        np.minimum(window, compute_segment_distance(nodes, wall), out=window)
+    def _add_walls(self, walls: Float) -> None:
+        for wall in walls:
+            ends = wall.reshape(2, 2)
+            low = (ends.min(axis=0) - _MAX_CLEARANCE - self.origin) / SPACING
+            high = (ends.max(axis=0) + _MAX_CLEARANCE - self.origin) / SPACING
+            (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int) + 2
+            window = self.clearance[y0:y1, x0:x1]
+            rows, columns = np.indices(window.shape)
+            nodes = self.origin + np.stack([columns + x0, rows + y0], axis=-1) * SPACING
+            np.minimum(window, compute_segment_distance(nodes, wall), out=window)
 
     def clearance_at(self, xy: Float) -> tuple[Float, Float]:
         """Clearance (N,) in metres at points (N, 2), bilinear, and its gradient (N, 2)."""

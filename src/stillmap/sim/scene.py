@@ -92,9 +92,8 @@ class Stay:
     until: float | None = None
 
     def __post_init__(self) -> None:
-        options.require(
-            self.until is None or self.until > self.since, "a stay must end after it began"
-        )
+        lasts = self.until is None or self.until > self.since
+        options.require(lasts, "a stay must end after it began")
 
 
 @dataclass(frozen=True)
@@ -110,9 +109,8 @@ class Thing:
     stays: tuple[Stay, ...]
 
     def __post_init__(self) -> None:
-        options.require(
-            len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays"
-        )
+        is_whole = len(self.faces) > 0 and len(self.stays) > 0
+        options.require(is_whole, "a thing needs faces and stays")
         for stay, later in itertools.pairwise(self.stays):
             in_order = stay.until is not None and stay.until <= later.since
             options.require(in_order, "stays of a thing must come one after the other")
@@ -163,27 +161,28 @@ class Scene:
     mirrors: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
-        options.require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")
-        options.require(len(self.route) > 0, "a scene needs a route")
         sweep_share = self.laser.sweep_time * self.robot.scan_rate
-        options.require(sweep_share <= 1 + 1e-9, "sweep_time must not exceed the scan period")
-        if self.rig.tilts:
-            options.require(not self.lidar.channels, "a rig of two lasers has no lidar")
-            usual = not self.laser.second_laser and self.laser.upside_down == "no"
-            options.require(usual, "a rig has one upright horizontal laser")
+        is_usual = not self.laser.second_laser and self.laser.upside_down == "no"
         angle = abs(self.rig.middle) + self.rig.amplitude
-        options.require(
-            angle <= options.MAX_ELEVATION, "the laser must not tilt by more than 85 degrees"
-        )
         lowest, highest = self.lidar.field
-        options.require(lowest <= highest, "elevations must satisfy low <= high")
         can_see = self.in_3d or not self.camera.enabled
-        options.require(can_see, "cameras need a 3D world: a lidar, or a tilting laser")
+        rules = {
+            "a scene needs walls": len(self.walls) + len(self.glass) > 0,
+            "a scene needs a route": len(self.route) > 0,
+            "sweep_time must not exceed the scan period": sweep_share <= 1 + 1e-9,
+            "a rig of two lasers has no lidar": not (self.rig.tilts and self.lidar.channels),
+            "a rig has one upright horizontal laser": is_usual or not self.rig.tilts,
+            "the laser must not tilt by more than 85 degrees": angle <= options.MAX_ELEVATION,
+            "elevations must satisfy low <= high": lowest <= highest,
+            "cameras need a 3D world: a lidar, or a tilting laser": can_see,
+        }
         for section in (self.crowd, self.doors, self.traffic):
             for low in [name for name in vars(section) if name.startswith("min_")]:
                 high = low.replace("min_", "max_")
                 is_ordered = getattr(section, low) <= getattr(section, high)
-                options.require(is_ordered, f"{low} must not exceed {high}")
+                rules[f"{low} must not exceed {high}"] = is_ordered
+        for rule, holds in rules.items():
+            options.require(holds, rule)
 
     @property
     def in_3d(self) -> bool:

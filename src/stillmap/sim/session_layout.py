@@ -9,6 +9,7 @@ import numpy as np
 import scipy  # its parts load when they are first used
 
 from stillmap.core.array_types import Bool, Float
+from stillmap.core.segments import segments_meet_box
 from stillmap.sim.dynamics import place_faces
 from stillmap.sim.planner import SPACING, FreeSpace, compute_segment_distance
 from stillmap.sim.scene import Door, Scene, Segment, Stay, Thing
@@ -185,14 +186,7 @@ def meets_box(solid: Float, place: Place, half: Float) -> bool:
     """True if a surface (K, 4) meets the box with half extents (2,) at a place."""
     c, s = math.cos(place.yaw), math.sin(place.yaw)
     local = (solid.reshape(-1, 2, 2) - place[:2]) @ np.array([[c, -s], [s, c]])
-    start, along = local[:, 0], local[:, 1] - local[:, 0]
-    parallel = np.abs(along) < 1e-12
-    step = np.where(parallel, 1.0, along)
-    a, b = (-half - start) / step, (half - start) / step
-    inside = np.abs(start) <= half
-    first = np.where(parallel, np.where(inside, 0.0, np.inf), np.minimum(a, b)).max(axis=1)
-    last = np.where(parallel, np.where(inside, 1.0, -np.inf), np.maximum(a, b)).min(axis=1)
-    return bool(np.any(np.maximum(first, 0.0) <= np.minimum(last, 1.0)))
+    return bool(segments_meet_box(local[:, 0], local[:, 1], half).any())
 
 
 def _is_in_sight(place: Place, nodes: Float, solid: Float) -> bool:

@@ -93,14 +93,8 @@ def plan_sessions(
         layout.add_session()
     scenes, stamps = [], []
     for session, rng in enumerate(rngs):
-        things = [item.thing(session) for item in layout.objects]
-        base = replace(
-            scene,
-            walls=layout.walls,
-            leaves=(),
-            lights=(),
-            things=tuple(thing for thing in things if thing is not None),
-        )
+        things = tuple(filter(None, (item.thing(session) for item in layout.objects)))
+        base = replace(scene, walls=layout.walls, leaves=(), lights=(), things=things)
         usual = draw_piece if _is_drive(scene) else draw_tour
         base = _send_robot(base, routes[session] if routes else usual, rng)
         scenes.append(_mount_sensor(base, 0 < session == odd, rng))
@@ -120,15 +114,11 @@ def simulate_sessions(plan: SessionPlan) -> Iterator[Simulation]:
     for session, (scene, seed) in enumerate(zip(plan.scenes, plan.seeds, strict=True)):
         made = simulate(scene, seed)
         recording, truth = made.recording, made.truth
-        later = recording.stamp_ns + plan.first_stamp_ns[session]
+        recording = replace(recording, stamp_ns=recording.stamp_ns + plan.first_stamp_ns[session])
         thing = np.full(len(truth.mover), -1, np.int32) if truth.thing is None else truth.thing
         present = [k for k, item in enumerate(plan.objects) if item.places[session] is not None]
         which = np.array([*present, -1], np.int32)  # -1 stays -1
-        yield replace(
-            made,
-            recording=replace(recording, stamp_ns=later),
-            truth=replace(truth, thing=which[thing]),
-        )
+        yield replace(made, recording=recording, truth=replace(truth, thing=which[thing]))
 
 
 def write_sessions(

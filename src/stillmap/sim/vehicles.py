@@ -44,9 +44,9 @@ class Traffic:
         self._seconds = 0.0
         self._lanes = [_Track(lane) for lane in lanes]
         self._options, self._rng = options, rng
-        self._lane = np.array(_spread(lanes, options.vehicles), np.int64)
-        V = len(self._lane)
-        own = [lanes[k] for k in self._lane.tolist()]
+        lane = np.array(_spread(lanes, options.vehicles), np.int64)
+        self._on = [np.flatnonzero(lane == k) for k in range(len(lanes))]
+        own, V = [lanes[k] for k in lane.tolist()], len(lane)
         self.kinds = [lane.kind for lane in own]
         self.size = _sizes(self.kinds, rng)
         self._wanted = rng.uniform(options.min_speed, options.max_speed, V)
@@ -60,8 +60,7 @@ class Traffic:
     def poses(self) -> Float:
         """(V, 3) centers in metres and headings in radians."""
         poses = np.zeros((len(self._at), 3))
-        for k, track in enumerate(self._lanes):
-            on = self._lane == k
+        for track, on in zip(self._lanes, self._on, strict=True):
             # both axles are on the path
             half = 0.3 * self.size[on, 0]
             rear, front = track.points(self._at[on] - half), track.points(self._at[on] + half)
@@ -97,14 +96,13 @@ class Traffic:
         room = np.maximum(gap - 0.25 * _GAP, 0.0) / dt
         self.speed = np.minimum(np.maximum(self.speed + change, 0.0), room)
         self._at = self._at + self.speed * dt
-        for k, track in enumerate(self._lanes):
-            self._at[self._lane == k] %= track.length
+        for track, on in zip(self._lanes, self._on, strict=True):
+            self._at[on] %= track.length
         self._stop_now_and_then(self.speed * dt)
 
     def _first_places(self, jitter: Float) -> Float:
-        places = np.zeros(len(self._lane))
-        for k, track in enumerate(self._lanes):
-            on = np.flatnonzero(self._lane == k)
+        places = np.zeros(len(jitter))
+        for track, on in zip(self._lanes, self._on, strict=True):
             if track.lane.waiting:
                 taken = np.cumsum(self.size[on, 0] + _GAP) - (self.size[on, 0] + _GAP) / 2
                 places[on] = track.lane.stop - taken
@@ -113,16 +111,15 @@ class Traffic:
         return places
 
     def _release(self, robot: Float) -> None:
-        for k, track in enumerate(self._lanes):
+        for track, on in zip(self._lanes, self._on, strict=True):
             if np.hypot(*(robot - track.lane.go)) < _RELEASE:
-                self._waits[self._lane == k] = False
+                self._waits[on] = False
 
     def _gaps(self, robot: Float, radius: float) -> Float:
         """(V,) metres to the next obstacle on the same lane."""
         gaps = np.full(len(self._at), np.inf)
-        for k, track in enumerate(self._lanes):
-            on = np.flatnonzero(self._lane == k)
-            on = on[np.argsort(self._at[on], kind="stable")]
+        for track, vehicles in zip(self._lanes, self._on, strict=True):
+            on = vehicles[np.argsort(self._at[vehicles], kind="stable")]
             if len(on) > 1:
                 ahead = np.roll(on, -1)
                 between = (self._at[ahead] - self._at[on]) % track.length

@@ -42,9 +42,8 @@ def make_static_world(scene: Scene, ground: geometry.Ground) -> geometry.StaticS
     ends = [*lines, *scene.glass, *lintels, *kerbs]
     is_glass = np.zeros(len(ends), bool)
     is_glass[len(lines) : len(lines) + len(scene.glass)] = True
-    faces = geometry.Faces(
-        np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass
-    )
+    segments = np.reshape(ends, (-1, 4)).astype(float)
+    faces = geometry.Faces(segments, np.reshape(z, (-1, 2)), is_glass)
     parts = [(k, -1, p) for k, loop in enumerate(loops) for p in make_parts(loop, scene.heights)]
     poses = np.reshape([loop[:3] for loop in loops], (1, -1, 3)).astype(float)
     solids = geometry.assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))

@@ -107,14 +107,11 @@ def fit_box(mover: MovingObject, start: int, hold: float) -> Box:
     speed = np.linalg.norm(mover.velocity, axis=1)
     moving = np.flatnonzero(speed > HEADING_SPEED)
     half = (0.5 * mover.size[0], 0.5 * mover.size[1])
-    if not len(moving):  # its heading is unknown
-        heading = np.tile([1.0, 0.0], (len(seconds), 1))
-        return Box(
-            mover.id, seconds, mover.xy, heading, mover.velocity, (max(half), max(half)), hold
-        )
-    # at rest it keeps the heading of its last motion
-    at = moving[np.clip(np.searchsorted(moving, np.arange(len(speed)), "right") - 1, 0, None)]
-    heading = mover.velocity[at] / speed[at, None]
+    if len(moving):  # at rest it keeps the heading of its last motion
+        at = moving[np.clip(np.searchsorted(moving, np.arange(len(speed)), "right") - 1, 0, None)]
+        heading = mover.velocity[at] / speed[at, None]
+    else:  # its heading is unknown
+        heading, half = np.tile([1.0, 0.0], (len(seconds), 1)), (max(half), max(half))
     return Box(mover.id, seconds, mover.xy, heading, mover.velocity, half, hold)
 
 

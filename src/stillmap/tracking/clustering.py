@@ -75,15 +75,10 @@ def extract_dynamic_points(
     # stamps may go backwards where clocks jump; time does not
     seconds = np.maximum.accumulate(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]))
     scratch = recording.scratch
+    types = {"scan": np.intp, "beam": np.intp, "xy": float, "range": float, "cluster": np.intp}
     columns = {
-        name: ArrayBuilder(dtype, row, scratch)
-        for name, dtype, row in (
-            ("scan", np.intp, ()),
-            ("beam", np.intp, ()),
-            ("xy", np.float64, (2,)),
-            ("range", np.float64, ()),
-            ("cluster", np.intp, ()),
-        )
+        name: ArrayBuilder(dtype, (2,) if name == "xy" else (), scratch)
+        for name, dtype in types.items()
     }
     count = np.zeros(recording.n_scans + 1, np.intp)
     n_clusters = 0

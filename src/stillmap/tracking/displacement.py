@@ -97,9 +97,7 @@ def _is_empty(views: Sequence[_PlaceView], during: Sequence[_PlaceView]) -> bool
     """
     views = [view for view in views if view.around >= _MIN_BEAMS]
     passed = [view for view in views if not view.stopped]
-    through, inside = (
-        sum(getattr(view, name) for view in during) for name in ("through", "inside")
-    )
+    through, inside = sum(view.through for view in during), sum(view.inside for view in during)
     p_pass = 1.0 - inside / max(through, 1)
     expected = sum(view.through for view in passed)
     return 2 * len(passed) > len(views) and p_pass**expected < _MAX_P_MISSED

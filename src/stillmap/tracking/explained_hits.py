@@ -5,7 +5,6 @@ a wall. Its path shows that it was there at these times: only hits at other time
 the place itself. Walkers explain hits as well if their tracks certainly are of movers.
 """
 
-import math
 from collections.abc import Container, Iterator, Sequence
 from typing import NamedTuple
 
@@ -14,7 +13,8 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
-from stillmap.mapping.changed_objects import cell_keys
+from stillmap.core.square_box import cell_keys
+from stillmap.em.mixture import log_beta
 from stillmap.tracking.association import ACCELERATION
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
@@ -96,18 +96,11 @@ def explain_hits(
     log_ratio = compute_log_ratio(explained, np.maximum(others, 0.0))
     on_vehicle = is_vehicle[path]
     by_vehicles = np.bincount(place, weight * on_vehicle, minlength=len(places)).astype(np.float64)
-    p_place = np.where(
-        on_vehicle, fit_share(log_ratio, by_vehicles)[place], compute_probability(log_ratio)[place]
-    )
+    of_vehicles, of_walkers = fit_share(log_ratio, by_vehicles), compute_probability(log_ratio)
+    p_place = np.where(on_vehicle, of_vehicles[place], of_walkers[place])
     out = arrays.copy(p_static, recording.scratch)
     out[beam] *= (1.0 - weight * (1.0 - p_place)).astype(np.float32)
     return out
-
-
-def log_beta(a: Float | float, b: Float | float) -> Float:
-    """ln B(a, b) of the beta function, of positive numbers."""
-    log_gamma = np.frompyfunc(math.lgamma, 1, 1)  # scipy.special takes 0.1 s and 13 MB to load
-    return np.asarray(log_gamma(a) + log_gamma(b) - log_gamma(a + b), np.float64)
 
 
 def compute_log_ratio(explained: Float, others: Float) -> Float:

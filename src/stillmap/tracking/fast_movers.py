@@ -15,6 +15,7 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
+from stillmap.tracking.detections import count_tracks
 from stillmap.tracking.mover_path import MAX_SPEED, MIN_SPEED, MoverPath, fit_path, follow
 
 _MAX_FRAGMENT = 0.6  # s: tracks of walkers that last for longer are none
@@ -95,7 +96,7 @@ def tracks_of_paths(points: DynamicPoints, owner: Index, paths: list[MoverPath])
 
 def _find_lasting(points: DynamicPoints, owner: Index) -> Bool:
     """(K,) tracks that are seen for longer than in passing, and in most scans."""
-    n = max(int(owner[block].max()) for block in arrays.iter_blocks(owner)) + 1
+    n = count_tracks(owner)
     scans, last = np.zeros((2, n), np.intp)
     first = np.full(n, len(points.seconds) - 1)
     for block in arrays.iter_blocks(owner, points.scan):
@@ -218,9 +219,8 @@ def _extend(clusters: _Clusters, seeds: _Seeds) -> _Seeds:
     xy = clusters.edge[later, seeds.side[which]]
     off = xy - seeds.xy[which, -1] - dt[:, None] * velocity[which]
     along = (off * u[which]).sum(axis=1) / _GATE_ALONG
-    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / (
-        _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
-    )
+    gate = _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
+    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / gate
     cost = along**2 + across**2
     near = np.flatnonzero(cost < 1.0)
     order = near[np.lexsort((cost[near], which[near]))]

@@ -109,9 +109,8 @@ def compute_marginals(before: Index, after: Index, log_ratio: Float, n: int) -> 
     for _ in range(_ROUNDS):
         pull = ratio * free
         # a sum less one of its terms can be negative by rounding
-        pull = ratio / (
-            1.0 + np.maximum(np.bincount(before, pull, minlength=n)[before] - pull, 0.0)
-        )
+        others = np.maximum(np.bincount(before, pull, minlength=n)[before] - pull, 0.0)
+        pull = ratio / (1.0 + others)
         free = 1.0 / (1.0 + np.maximum(np.bincount(after, pull, minlength=n)[after] - pull, 0.0))
     pull = ratio * free
     return np.asarray(pull / (1.0 + np.bincount(before, pull, minlength=n)[before]))

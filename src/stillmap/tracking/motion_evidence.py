@@ -20,6 +20,7 @@ from stillmap.core import arrays
 from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import group_indices
+from stillmap.em.mixture import log_beta
 from stillmap.em.shape_evidence import find_lost_beams
 from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
@@ -30,7 +31,6 @@ from stillmap.tracking.explained_hits import (
     find_mover_hits,
     fit_share,
     iterate_walker_paths,
-    log_beta,
 )
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath
@@ -306,7 +306,6 @@ def _classify_places(points: Float32, place: Float) -> Index:
     count = near.sum(axis=1)
     past = 2 * (near & (distance[beams] > far[:, None] + _DEPTH)).sum(axis=1) > count
     before = 2 * (near & (distance[beams] < far[:, None] - _DEPTH)).sum(axis=1) > count
-    visibility = np.where(
-        past, Visibility.PASSED, np.where(before, Visibility.HIDDEN, Visibility.REACHED)
-    )
+    not_past = np.where(before, Visibility.HIDDEN, Visibility.REACHED)
+    visibility = np.where(past, Visibility.PASSED, not_past)
     return np.where(nearest > _MAX_BEARING, Visibility.HIDDEN, visibility).astype(np.intp)

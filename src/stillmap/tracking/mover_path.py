@@ -21,11 +21,8 @@ _GATE, _MAX_GATE, _GATE_SIGMAS = 0.3, 1.2, 2.0  # m, m, standard deviations of t
 _LENGTH, _HALF_WIDTH = 6.5, 1.3  # m, of a large van
 _EDGE_DEPTH = 0.4  # m of the object that count as its edge
 _MAX_GAP = 1.2  # s without a point
-_MIN_DETECTIONS, _MIN_TRAVEL, _MIN_FOUND = (
-    5,
-    3.0,
-    0.6,
-)  # detections, m, share of the detections: a track
+_MIN_DETECTIONS, _MIN_TRAVEL = 5, 3.0  # of a track; m
+_MIN_FOUND = 0.6  # share of the scans of a track that detect it
 _EXTENT_DETECTIONS = 3  # that see as much of it as its length and width
 
 

@@ -14,11 +14,7 @@ from stillmap.core.config import CheckedOptions, option
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks
-from stillmap.tracking.clustering import (
-    MIN_P_DYNAMIC,
-    DynamicPoints,
-    extract_dynamic_points,
-)
+from stillmap.tracking.clustering import MIN_P_DYNAMIC, DynamicPoints, extract_dynamic_points
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath, smooth_track

@@ -181,18 +181,16 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     parts, scans = list[tuple[Index, Index]](), np.zeros(count_tracks(owner), np.intp)
     for here in scan_blocks(points, owner):
         centroids = compute_centroids(points, owner, here)
-        pairs = np.sort(
-            centroids.track[find_near_pairs(centroids.scan, centroids.xy, _PAIR_DISTANCE)], axis=1
-        )
+        near = find_near_pairs(centroids.scan, centroids.xy, _PAIR_DISTANCE)
+        pairs = np.sort(centroids.track[near], axis=1)
         parts.append(np.unique(pairs, axis=0, return_counts=True))
         scans += np.bincount(centroids.track, minlength=len(scans))
-    tracks, which = np.unique(
-        np.concatenate([pairs for pairs, _ in parts]), axis=0, return_inverse=True
-    )
+    all_pairs, counts = (np.concatenate(column) for column in zip(*parts, strict=True))
+    tracks, which = np.unique(all_pairs, axis=0, return_inverse=True)
     if len(tracks) == 0:
         return owner
     count = np.zeros(len(tracks), np.intp)
-    np.add.at(count, which.reshape(-1), np.concatenate([count for _, count in parts]))
+    np.add.at(count, which.reshape(-1), counts)
     together = count >= _MIN_SHARED * scans[tracks].min(axis=1)
     label = component_labels(tracks[together], len(scans))
     _, first, which = np.unique(label, return_index=True, return_inverse=True)

@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import resources
+from itertools import chain
 from typing import Any, get_type_hints
 
 import msgspec
@@ -30,15 +31,10 @@ def load_world(name: str) -> Scene:
     tree = tomllib.loads((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
     base, cleared = tree.pop("extends", None), tree.pop("cleared", [])
     sections = {key: tree.pop(key) for key in list(tree) if isinstance(tree[key], dict)}
-    for part, key in [
-        (tree, "walls"),
-        (tree, "kerbs"),
-        *((t, "faces") for t in tree.get("things", [])),
-    ]:
-        if key in part:
-            part[key] = [
-                segment for kind, *values in part[key] for segment in PIECES[kind](*values)
-            ]
+    for part in (tree, *tree.get("things", [])):
+        for key in part.keys() & {"walls", "kerbs", "faces"}:
+            pieces = (PIECES[kind](*values) for kind, *values in part[key])
+            part[key] = list(chain.from_iterable(pieces))
     values = {key: msgspec.convert(rows, _TYPES[key]) for key, rows in tree.items()}
     values["name"] = name
     scene = Scene(**values) if base is None else dataclasses.replace(load_world(base), **values)
