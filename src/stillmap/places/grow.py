@@ -11,7 +11,9 @@ import numpy as np
 
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float
+from stillmap.core.local_frame import shift_poses
 from stillmap.core.short_repr import ShortRepr
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.place import (
     Place,
@@ -48,9 +50,7 @@ def lift_alignment(place: Place, session: Session, placement: Placement) -> Floa
     """
     if session.dimension == 2:
         return placement.T @ session.node_poses
-    T = np.eye(4)
-    T[:2, :2], T[:2, 3] = placement.T[:2, :2], placement.T[:2, 2]
-    nodes = T @ session.node_poses
+    nodes = embed_in_3d(placement.T) @ session.node_poses
     clearance = session.clearance[session.keyframes.nodes]
     at, rise = [np.zeros((0, 3))], [np.zeros(0)]
     for known in place.sessions:
@@ -78,12 +78,9 @@ def _tilt(at: Float, rise: Float) -> Float:
             np.column_stack([offset[kept], np.ones(int(kept.sum()))]), rise[kept], rcond=None
         )[0]
         slope, height = np.clip(fit[:2], -_MAX_TILT, _MAX_TILT), float(fit[2])
-    to_centre = np.eye(4)
-    to_centre[:3, 3] = centre
-    back = np.eye(4)
-    back[:3, 3] = -centre
     # a rotation vector (slope_y, -slope_x, 0) raises a point by its offset times the slope
     turn = se3.exp(np.array([0.0, 0.0, height, slope[1], -slope[0], 0.0]))
+    to_centre, back = (shift_poses(np.eye(4), by) for by in (centre, -centre))
     return np.asarray(to_centre @ turn @ back)
 
 

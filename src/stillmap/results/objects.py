@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core import se2
 from stillmap.core.arrays import write_npz
 from stillmap.core.local_frame import FAR
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.point_cloud import Fields, coordinate_fields, ply_header
 from stillmap.results.reader import Track
@@ -109,9 +111,8 @@ def interpolate_pose(track: Mover, stamp_ns: int) -> Float:
     # differences first: stamps in ns exceed the precision of float64
     seconds = 1e-9 * (track.stamp_ns - stamp_ns)
     x, y, angle = (np.interp(0.0, seconds, row) for row in (*track.xy.T, headings(track.velocity)))
-    T = np.eye(4)
-    T[0, :2], T[1, :2] = (np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))
-    T[:3, 3] = x, y, 0.0 if track.z is None else np.interp(0.0, seconds, track.z)
+    T = embed_in_3d(se2.matrix(x, y, angle))
+    T[2, 3] = 0.0 if track.z is None else np.interp(0.0, seconds, track.z)
     return T
 
 

@@ -18,7 +18,7 @@ from stillmap.io.carmen.log import CarmenLog, read_log
 from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
-from stillmap.io.trajectory import MAX_BYTES, read_tum
+from stillmap.io.trajectory import MAX_BYTES, embed_in_3d, read_tum
 from stillmap.results.reader import Labels
 
 Bool = NDArray[np.bool_]
@@ -156,8 +156,7 @@ def read_trajectory(path: Path) -> Trajectory:
     """
     if len(_first_row(path, _POSE)) == 4:
         rows = _rows(path, 4, "t x y theta")
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, [[0], [1], [3]], [0, 1, 3]] = se2.matrix(*rows[:, 1:].T)
+        poses = embed_in_3d(se2.matrix(*rows[:, 1:].T))
         stamps = rows[:, 0]
     else:
         stamp_ns, poses = read_tum(path)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
+from stillmap.io.trajectory import quaternion_from_pose
 from stillmap.results.report.template import render_part
 from stillmap.results.viewer.scene import Scene
 from stillmap.results.viewer.server import Server
@@ -123,7 +123,7 @@ class Nodes:
 
     def place(self, node: Any, T: Float) -> None:
         """Place a node at a pose (4, 4) in the map frame."""
-        node.wxyz, node.position = quaternions(T[:3, :3]), T[:3, 3] - self.scene.origin
+        node.wxyz, node.position = quaternion_from_pose(T), T[:3, 3] - self.scene.origin
 
 
 class Labels:
@@ -141,12 +141,6 @@ class Labels:
             label.visible = n < len(texts)
             if label.visible:
                 label.text, label.position = texts[n]
-
-
-def quaternions(R: Float) -> Float:
-    """Quaternions (..., 4), w first, of rotations (..., 3, 3)."""
-    xyzw = scipy.spatial.transform.Rotation.from_matrix(R).as_quat()
-    return np.asarray(np.roll(xyzw, 1, axis=-1))
 
 
 def node_path(layer: str, part: str = "") -> str:

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
+from stillmap.io.trajectory import quaternion_from_pose
 from stillmap.results.colors import color_by_id
 from stillmap.results.objects import interpolate_pose
 from stillmap.results.reader import Track
-from stillmap.results.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path, quaternions
+from stillmap.results.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path
 
 Float = NDArray[np.float64]
 # the unit cube: bits 0 to 2 of a corner are its side in x, y, z
@@ -179,7 +180,7 @@ class ObjectNodes:
         self._sides.visible = bool(len(T))
         if len(T):
             self._sides.batched_positions = (T[:, :3, 3] - self._nodes.origin(1)).astype(np.float32)
-            self._sides.batched_wxyzs = quaternions(T[:, :3, :3]).astype(np.float32)
+            self._sides.batched_wxyzs = quaternion_from_pose(T).astype(np.float32)
             self._sides.batched_scales = np.maximum(size, _MIN_THICKNESS).astype(np.float32)
             self._sides.batched_colors = color
 
