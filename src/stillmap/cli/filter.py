@@ -25,9 +25,7 @@ from stillmap.cli.convert import NAMES
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from stillmap.core.array_types import Bool, Float32
     from stillmap.core.recording import Recording
     from stillmap.io.filter_writers import FilterTarget
     from stillmap.results.folder import ResultFolder
@@ -209,8 +207,8 @@ def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget
 
 
 def _select_beams(
-    recording: "Recording", p_static: "NDArray[np.float32]", below: float, scratch: Path
-) -> "tuple[NDArray[np.bool_], int, int]":
+    recording: "Recording", p_static: "Float32", below: float, scratch: Path
+) -> "tuple[Bool, int, int]":
     """(M,) the beams to blank; how many hit something, and how many of these are blanked."""
     import numpy as np
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.cli.console import list_files, say, show_share
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.errors import InputError, MissingExtra, advise, split_advice
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
@@ -40,7 +40,7 @@ class Inputs(NamedTuple):
 
     recording: Recording
     options: Options
-    poses: NDArray[np.float64] | None
+    poses: Float | None
     tilting: Recording | None
 
 
@@ -254,7 +254,7 @@ def print_summary(
     say(f"see it over time: stillmap view {shlex.quote(str(output))}")
 
 
-def _describe_hits(recording: Recording, p_static: NDArray[np.float32]) -> str:
+def _describe_hits(recording: Recording, p_static: Float32) -> str:
     counts = count_beams(recording, p_static)
     share = 100.0 * counts["dynamic"] / max(counts["hits"], 1)
     return f"{counts['hits']} beams that hit something, {share:.1f} % of them dynamic"

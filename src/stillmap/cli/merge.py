@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli import arguments
 from stillmap.cli.console import list_files, print_json, say, show_progress
-from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.places.finish import PlaceResult
@@ -43,22 +42,14 @@ def run(args: argparse.Namespace) -> int:
         InputError: an input or the output is at fault, or fewer than two sessions could be placed.
     """
     from stillmap.core.files import require_new
-    from stillmap.places.inputs import list_sessions
-    from stillmap.places.merge import MergeJob, merge_sessions
-    from stillmap.results.reader import RECORD, is_place
-    from stillmap.results.timeline import read_sessions
+    from stillmap.places.merge import merge_sessions, plan_merge
+    from stillmap.results.reader import RECORD
 
     options, output = arguments.options_from_args(args), Path(args.output)
-    base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
-    paths = args.input if base is None else args.input[1:]
-    if not paths:
-        raise InputError("names no session to add", where=args.input[0])
     require_new(output, RECORD, args.overwrite)
     for path in args.input:
         arguments.require_apart(output, Path(path))
-    taken = [] if base is None else [session.name for session in read_sessions(base)]
-    sessions = list_sessions([[path] for path in paths], taken)
-    job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
+    job = plan_merge(args.input, options, args.frame, args.map_state, not args.no_odometry)
     with (
         arguments.make_parents(output),
         show_progress(args.quiet, options.em.max_iterations) as progress,

@@ -2,7 +2,7 @@
 them door leaves, which are straight, hinged, and beside a gap in a wall that they could shut."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.places.place_states import PlaceStates, are_near
+from stillmap.results.timeline import Kind
 
 # m: length of what is seen of a leaf, half its thickness with noise
 _LENGTH, _THICKNESS = (0.3, 1.6), 0.12
@@ -97,9 +98,6 @@ def _covers(depth: Float) -> bool:
     """True if points at depths (n,) in a wall, metres, fill its first part."""
     filled = np.unique(np.floor(depth[depth < _POST] / _STEP))
     return len(filled) >= 0.75 * _POST / _STEP
-
-
-Kind = Literal["appeared", "gone", "moved", "door"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.array_folder import FORMAT_VERSION, write_arrays
 from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.config import to_dict
@@ -38,13 +38,7 @@ from stillmap.places.place_map import (
     show_state,
 )
 from stillmap.places.place_states import PlaceStates, estimate_place
-from stillmap.places.store import (
-    TIES,
-    read_beam_cells,
-    write_joined_beams,
-    write_placement,
-    write_ties,
-)
+from stillmap.places.store import STATE, TIES, read_beam_cells, write_joined_beams, write_ties
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.point_cloud import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
@@ -80,11 +74,6 @@ class PlaceResult(ShortRepr):
     changes: list[PlaceChange]
     shown: ShownState
     planar: ShownState
-
-    @property
-    def names_in_time(self) -> list[str]:
-        """Names of the sessions in the order of time."""
-        return [placed.session.name for placed in self.place.in_time()]
 
 
 def finish_place(
@@ -233,7 +222,7 @@ def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, tim
     beams = read_beam_cells(home, placed.session, place.voxel_size)
     centres = beams.place_centres(placed.session.node_poses, placed.nodes)
     write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
-    write_placement(home, placed)
+    write_arrays(home / STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
 
 
 def _to_map_frame(place: Place) -> Shift:
@@ -270,7 +259,8 @@ def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
 
 def _write_place_files(folder: Path, result: PlaceResult) -> None:
     """Write the files of the place as a whole, but the map, the report and `run.json`."""
-    place, by, names = result.place, _to_map_frame(result.place), result.names_in_time
+    place, by = result.place, _to_map_frame(result.place)
+    names = [placed.session.name for placed in place.in_time()]
     homes = [folder / "sessions" / placed.session.name for placed in place.sessions]
     poses = shift_poses(np.concatenate([placed.poses for placed in place.sessions]), by.metres)
     with (folder / "trajectory.tum").open("wb") as file:

@@ -4,7 +4,6 @@ M-step: constraints between keyframes given P(static), and the pose graph of all
 the evidence of each session, and the chain over sessions for each cell.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float
 from stillmap.core.local_frame import shift_poses
+from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import embed_in_3d
 from stillmap.places.keyframes import Keyframes, Session
@@ -127,7 +127,7 @@ def _place_session(session: Session, nodes: Float) -> PlacedSession:
 
 
 def add_session(
-    place: Place, session: Session, threads: int, report: Callable[[str], None] = lambda _: None
+    place: Place, session: Session, threads: int, report: Progress = no_progress
 ) -> Growth:
     """Add a session to a place, if the evidence is clear about where it lies.
 
@@ -137,7 +137,7 @@ def add_session(
         threads: the result does not depend on it.
         report: called with the step that begins.
     """
-    report("aligning")
+    report("aligning", 0, 0, 0)
     placement = find_placement(place.sessions, session)
     if placement.refused and not placement.rivals:
         return Growth(place, placement.refused)
@@ -150,7 +150,7 @@ def add_session(
     for number in range(_EM_ROUNDS):
         if states is not None:
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
-        report("optimizing poses")
+        report("optimizing poses", 0, 0, 0)
         ties = make_ties(matches, len(place.sessions))
         if place.dimension == 3 or not placement.matches:
             ties.append(_tie_maps(place, start))
@@ -162,7 +162,7 @@ def add_session(
         placed = grown.sessions[-1]
         if number + 1 == _EM_ROUNDS:
             break
-        report("comparing sessions")
+        report("comparing sessions", 0, 0, 0)
         grown = update_evidence(grown, threads, _MAX_MOTION)
         states = estimate_planar(grown)  # E-step
         if place.dimension == 2 and (differ := _differing_share(grown)) > _MAX_DIFFERING:

@@ -8,7 +8,6 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,7 +15,7 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, remove
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
-from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.profiling import Progress, no_progress, prefix_steps
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.pipeline.options import Options, adopt_cells
@@ -157,7 +156,7 @@ def _add_all(
             if session.dimension != place.dimension:
                 why = f"it is in {session.dimension}D, the place in {place.dimension}D"
             else:
-                report = partial(_report_step, progress, session.name)
+                report = prefix_steps(progress, session.name)
                 growth = add_session(place, session, threads, report)
                 place, why = growth.place, growth.refused
             if why:
@@ -167,10 +166,6 @@ def _add_all(
                 refusals.pop(session.name, None)
                 grew = True
     return place, [refusals[session.name] for session in pending]
-
-
-def _report_step(progress: Progress, name: str, step: str) -> None:
-    progress(f"{name}: {step}", 0, 0, 0)
 
 
 def _reframe(place: Place, name: str) -> Place:
@@ -188,13 +183,11 @@ def _reframe(place: Place, name: str) -> Place:
 
 
 def _check_job(job: MergeJob, names: Sequence[str]) -> None:
-    """Refuse, before any work, too few sessions, and a frame or a state of the map of none.
+    """Refuse, before any work, one session alone, and a frame or a state of the map of none.
 
     Raises:
         InputError: it is such a job.
     """
-    if not job.sessions:
-        raise InputError("no session is named that is to be merged")
     if len(names) < 2:
         raise InputError("one session alone is no place", hint="merge it with others, or map it")
     if job.frame is not None and job.frame not in names:
@@ -244,15 +237,33 @@ def merge(
     """
     if isinstance(sessions, str | os.PathLike):
         raise TypeError("sessions: expected a list of sessions, got one path")
-    chosen, (base, others) = to_options(options), _split_base(sessions)
-    taken = [] if base is None else [known.name for known in read_sessions(base)]
-    job = MergeJob(base, list_sessions(others, taken), chosen, frame, map_state, odometry)
-    with report_to(progress, chosen.em.max_iterations) as report:
+    job = plan_merge(sessions, to_options(options), frame, map_state, odometry)
+    with report_to(progress, job.options.em.max_iterations) as report:
         if output is not None:
             _require_apart(Path(output), job)
             merge_sessions(job, Path(output), overwrite, report)
             return load(Path(output))
         return _merge_temporarily(job, report)
+
+
+def plan_merge(
+    sessions: Sequence[SessionLike],
+    options: Options,
+    frame: str | None,
+    map_state: str,
+    odometry: bool,
+) -> MergeJob:
+    """The job of `merge`.
+
+    Raises:
+        InputError: no session is named, or one cannot be read.
+    """
+    base, others = _split_base(sessions)
+    if not others:
+        where = "" if base is None else str(base)
+        raise InputError("no session is named that is to be merged", where=where)
+    taken = [] if base is None else [known.name for known in read_sessions(base)]
+    return MergeJob(base, list_sessions(others, taken), options, frame, map_state, odometry)
 
 
 def _split_base(

@@ -73,11 +73,6 @@ def write_session(
     write_arrays(folder, {"scans": keyframes.scans.astype(np.int64), "e": keyframes.e})
 
 
-def write_placement(home: Path, placed: PlacedSession) -> None:
-    """Write where a session lies in its place, and where its evidence was measured."""
-    write_arrays(home / STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
-
-
 def write_ties(path: Path, ties: Sequence[Tie], D: int) -> None:
     """Write the constraints between sessions in D dimensions."""
     dof = 3 * (D - 1)

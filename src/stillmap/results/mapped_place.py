@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.recording import Recording
@@ -43,7 +44,6 @@ from stillmap.results.timeline import (
 from stillmap.slam import deskew_recording
 from stillmap.tracking import MovingObject
 
-Float = NDArray[np.float64]
 PathLike: TypeAlias = str | os.PathLike[str]
 Source: TypeAlias = Recording | PathLike | Sequence[PathLike]
 
@@ -54,9 +54,9 @@ class MappedPlace:
 
     map: GridMap
     poses: Float
-    stamp_ns: NDArray[np.int64]
-    p_static: NDArray[np.float32]
-    hit: NDArray[np.bool_]
+    stamp_ns: Int64
+    p_static: Float32
+    hit: Bool
     objects: Sequence[MovingObject | Track]
     sessions: list[PlaceSession]
     changes: list[SessionChange]
@@ -202,7 +202,7 @@ class MappedPlace:
         return sorted(placed, key=lambda scans: int(scans.start))
 
 
-def _only_session(noted: Any, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
+def _only_session(noted: Any, stamp_ns: Int64, poses: Float) -> PlaceSession:
     """The session of a result of one recording, whose frame is the map frame."""
     D, path = poses.shape[-1] - 1, noted if isinstance(noted, str) and noted else None
     times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)

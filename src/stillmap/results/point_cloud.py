@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import FAR
@@ -40,9 +41,9 @@ class Block(NamedTuple):
         colors: (n, 3) uint8; None for a cloud without colors.
     """
 
-    points: NDArray[np.float64]
-    p_static: NDArray[np.float32]
-    stamp_ns: NDArray[np.int64] | None
+    points: Float
+    p_static: Float32
+    stamp_ns: Int64 | None
     colors: NDArray[np.uint8] | None = None
 
 
@@ -59,7 +60,7 @@ class Cloud:
     """
 
     count: int
-    origin: NDArray[np.float64]
+    origin: Float
     start_ns: int | None
     make_blocks: Callable[[], Iterator[Block]]
     has_colors: bool = False
@@ -101,11 +102,11 @@ class Cloud:
 def cloud_from_recording(
     recording: Recording,
     deskewed: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
+    poses: Float,
+    p_static: Float32,
     only: Part | None = None,
     colors: NDArray[np.uint8] | None = None,
-    origin: NDArray[np.float64] | None = None,
+    origin: Float | None = None,
 ) -> Cloud:
     """All returns, in the order of the recording; memory is that of a few scans.
 
@@ -180,7 +181,7 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
     return Cloud(count, _find_origin(layouts), None, make_blocks, has_colors)
 
 
-def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
+def _find_origin(layouts: Sequence[TableLayout]) -> Float:
     """(3,) whole m near the points of files; zero where they are 32-bit, and so near it."""
     for layout in layouts:
         dtype = layout.dtype
@@ -192,21 +193,14 @@ def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
     return np.zeros(3)
 
 
-def _select(
-    hit: NDArray[np.bool_], p_static: NDArray[np.float32], only: Part | None
-) -> NDArray[np.bool_]:
+def _select(hit: Bool, p_static: Float32, only: Part | None) -> Bool:
     if only is None:
         return np.asarray(hit)
     dynamic = p_static < DYNAMIC_BELOW
     return np.asarray(hit & (dynamic if only == "dynamic" else ~dynamic))
 
 
-def _to_map_frame(
-    deskewed: Recording,
-    chunk: Chunk,
-    selected: NDArray[np.bool_],
-    T_map_sensor: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _to_map_frame(deskewed: Recording, chunk: Chunk, selected: Bool, T_map_sensor: Float) -> Float:
     """Selected end points of a chunk, (n, 3) m in the map frame."""
     out = np.empty((int(np.count_nonzero(selected)), 3))
     done, points = 0, deskewed.points[chunk.beams]
@@ -221,10 +215,10 @@ def _to_map_frame(
 def write_clouds(
     folder: Path,
     seen: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
+    poses: Float,
+    p_static: Float32,
     colours: NDArray[np.uint8] | None = None,
-    origin: NDArray[np.float64] | None = None,
+    origin: Float | None = None,
 ) -> None:
     """Write every hit to one of the two files; memory is that of a few scans.
 

@@ -11,16 +11,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Index
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.io.trajectory import pose_rows, poses_from_rows
 from stillmap.slam import PoseGraph
 from stillmap.slam.pose_graph import Constraint
-
-Float = NDArray[np.float64]
 
 _VERTEX = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 _EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
@@ -104,7 +102,7 @@ def read_g2o(path: Path) -> PoseGraph:
 
 
 def _to_constraints(
-    keyframes: NDArray[np.intp], ends: list[list[int]], edges: list[list[float]], D: int
+    keyframes: Index, ends: list[list[int]], edges: list[list[float]], D: int
 ) -> list[Constraint]:
     """The constraints of edges between vertices of these ids.
 

@@ -17,6 +17,7 @@ from stillmap.core.array_folder import (
     read_probabilities,
     read_record,
 )
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
@@ -25,7 +26,6 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.trajectory import MAX_TRANSLATION
 
-Float = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
 RECORD = "run.json"  # every result has it
@@ -53,14 +53,14 @@ class Grid(GridMap):
     """An occupancy map as stored in `map.npz`."""
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Bool:
         return self.p_occupied > OCCUPIED_THRESH
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bool:
         return self.p_occupied < FREE_THRESH
 
-    def cells(self, points: Float) -> NDArray[np.int64]:
+    def cells(self, points: Float) -> Int64:
         """(N, 2) row and column of the cells that hold (N, 2) points; may lie outside the map."""
         T_grid_map = se2.inverse(se2.matrix(*self.origin))
         return np.floor(moved(T_grid_map, points) / self.resolution).astype(np.int64)[:, ::-1]
@@ -112,10 +112,10 @@ class Labels(ShortRepr):
         hit: (M,) whether the beam ended on something.
     """
 
-    stamp_ns: NDArray[np.int64]
-    offset: NDArray[np.int64]
-    p_static: NDArray[np.float32]
-    hit: NDArray[np.bool_]
+    stamp_ns: Int64
+    offset: Int64
+    p_static: Float32
+    hit: Bool
 
 
 def read_labels(result: Path) -> Labels:
@@ -134,7 +134,7 @@ def read_labels(result: Path) -> Labels:
     return Labels(stamp_ns, offset, p_static, read_array(folder / "hit.npy", (beams,), np.bool_))
 
 
-def count_labels(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> dict[str, int]:
+def count_labels(hit: Bool, p_static: Float32) -> dict[str, int]:
     """`beams`, `hits`, `max_range`, `unusable` and `dynamic` of labels (M,)."""
     hits = dynamic = unusable = 0
     for block in iter_blocks(hit, p_static):
@@ -268,10 +268,10 @@ class Track(ShortRepr):
 
     id: int
     size: tuple[float, ...]
-    stamp_ns: NDArray[np.int64]
-    xy: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    z: NDArray[np.float64] | None = None
+    stamp_ns: Int64
+    xy: Float
+    velocity: Float
+    z: Float | None = None
     beams: int | None = None
     p_dynamic: float | None = None
     session: str = ""

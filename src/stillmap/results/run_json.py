@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.array_types import Bool
 from stillmap.core.config import to_dict
 from stillmap.core.files import package_version
 from stillmap.core.json import to_jsonable
+from stillmap.core.recording import Recording
 from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
@@ -35,11 +36,6 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         more: further keys and their values.
     """
     counts = count_beams(result.recording, result.p_static)
-    counts = {
-        "scans": result.recording.n_scans,
-        **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-        "skipped": result.recording.source.n_skipped,
-    }
     record = {
         "format_version": FORMAT_VERSION,
         "version": package_version(),
@@ -52,7 +48,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             key: {name: stage.get(key) for name, stage in result.stages.items()}
             for key in ("seconds", "cpu_seconds", "peak_memory_bytes")
         },
-        "counts": counts,
+        "counts": _counts(result.recording, counts),
         "area": known_area(result),
         "warnings": list(result.warnings),
         "quality": quality_record(result.quality),
@@ -70,6 +66,12 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
     }
     plain: dict[str, Any] = to_jsonable(record)
     return plain
+
+
+def _counts(recording: Recording, beams: Mapping[str, int], **more: int) -> dict[str, int]:
+    counts = {name: beams[name] for name in ("beams", "hits", "max_range", "unusable")}
+    skipped = recording.source.n_skipped
+    return {"scans": recording.n_scans, **counts, **more, "skipped": skipped}
 
 
 def _doubts(result: MappingResult) -> dict[str, Any]:
@@ -110,12 +112,7 @@ def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
     counts = count_beams(tilting.deskewed, tilting.p_static)
     return {
         "input": tilting.recording.source.to_dict(),
-        "counts": {
-            "scans": tilting.recording.n_scans,
-            **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-            "left_out": tilting.unposed_beams,
-            "skipped": tilting.recording.source.n_skipped,
-        },
+        "counts": _counts(tilting.recording, counts, left_out=tilting.unposed_beams),
         "dynamic": counts["dynamic"],
         "boxes": tilting.boxes_hit,
         "objects": len(tilting.objects),
@@ -128,7 +125,7 @@ def models_record(models: "Models") -> dict[str, Any]:
     place = models.assignment
     areas = place.mesh.areas()
 
-    def area(of: NDArray[np.bool_]) -> float:
+    def area(of: Bool) -> float:
         return round(float(areas[of].sum()), 4)
 
     used = {view.image for k, view in enumerate(models.views) if (place.view == k).any()}

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import write_arrays
+from stillmap.core.array_types import Float32
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, write_text
 from stillmap.core.grid_map import GridMap, Region, is_inside, limit_hits
@@ -96,10 +97,7 @@ def save(
 
 
 def write_labels(
-    folder: Path,
-    recording: Recording,
-    p_static: NDArray[np.float32],
-    colors: NDArray[np.uint8] | None = None,
+    folder: Path, recording: Recording, p_static: Float32, colors: NDArray[np.uint8] | None = None
 ) -> None:
     """Writes `stamp_ns`, `offset`, `p_static` and `hit` as .npy files into the new `folder`.
 

@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.json import to_jsonable
-
-Float = NDArray[np.float64]
-
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -136,19 +133,19 @@ def compute_log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> flo
     return mean(-np.log(np.where(positive, p, 1.0 - p)))
 
 
-def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> Index:
     """Bin of each probability: [0, 1/bins), ..., [1 - 1/bins, 1]."""
     return np.minimum((p * bins).astype(np.intp), bins - 1)
 
 
-def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> Index:
     """Quantile bin of each probability; equal ones share a bin."""
     _, group, size = np.unique(p, return_inverse=True, return_counts=True)
     middle = np.cumsum(size) - size / 2
     return (middle * bins / max(len(p), 1)).astype(np.intp)[group]
 
 
-def compute_calibration_error(p: Float, positive: Bool, bin_of: NDArray[np.intp]) -> float:
+def compute_calibration_error(p: Float, positive: Bool, bin_of: Index) -> float:
     """Mean over all beams of |share of positives - mean p| of their bin (Naeini et al. 2015)."""
     if not len(p):
         return NAN

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
 from stillmap.core.array_folder import read_array
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
@@ -20,10 +21,6 @@ from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
 from stillmap.io.trajectory import MAX_BYTES, embed_in_3d, read_tum
 from stillmap.results.reader import Labels
-
-Bool = NDArray[np.bool_]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +198,7 @@ def read_odometry(path: Path) -> Float:
     return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
-def to_seconds(stamp_ns: NDArray[np.int64]) -> Float:
+def to_seconds(stamp_ns: Int64) -> Float:
     """The double nearest to each stamp, as if parsed from its decimal text.
 
     Dividing the array would round twice, which moves current stamps by up to 2e-7 s.

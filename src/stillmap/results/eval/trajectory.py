@@ -16,13 +16,13 @@ from typing import Literal
 
 import numpy as np
 import scipy  # its parts load when they are first used
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.errors import InputError
 from stillmap.io.trajectory import nearest_index
 from stillmap.results.eval import readers
-from stillmap.results.eval.labels import Float, Scores
+from stillmap.results.eval.labels import Scores
 from stillmap.results.eval.readers import Truth
 
 Unit = Literal["m", "frames"]
@@ -54,7 +54,7 @@ class RelativeErrors(Scores):
 
 def associate_trajectories(
     estimated_s: Float, reference_s: Float, max_dt: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Index, Index]:
     """Indices of matching poses by their stamps.
 
     Equal arrays of stamps match one to one. Else each pose of the shorter trajectory is matched
@@ -148,7 +148,7 @@ def compute_relative_errors(
     )
 
 
-def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[Index, Index]:
     if unit == "frames":
         step = round(delta)
         if step != delta or step < 1:
@@ -186,9 +186,7 @@ def summarize_errors(error: Float) -> ErrorStats:
     )
 
 
-def read_paired_poses(
-    result: Path, truth: Truth
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_paired_poses(result: Path, truth: Truth) -> tuple[Float, Float]:
     """Poses (N, 4, 4) of a result and true ones (N, D+1, D+1) at the same stamps.
 
     Raises:
@@ -275,7 +273,7 @@ def compute_relation_errors(
 
 def _look_up_poses(
     times: Float, trajectory: Float, odometry: Float | None, max_dt: float
-) -> tuple[Float, NDArray[np.bool_], int]:
+) -> tuple[Float, Bool, int]:
     index = nearest_index(trajectory[:, 0], times)
     poses = trajectory[index, 1:]
     far = np.abs(trajectory[index, 0] - times) > max_dt

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.grid_map import limit_hits
 from stillmap.core.local_frame import find_origin, shift_poses
 from stillmap.core.recording import Recording
@@ -35,7 +35,6 @@ from stillmap.results.point_cloud import (
     make_vertices,
 )
 
-Float = NDArray[np.float64]
 Progress = Callable[[float], None]
 ScanWriter = Callable[[int], None]
 
@@ -196,9 +195,7 @@ def _make_frame_writer(bag: BagWriter, result: MappedPlace) -> ScanWriter:
     return write_frames
 
 
-def _make_object_writer(
-    bag: BagWriter, tracks: Sequence[Mover], stamp_ns: NDArray[np.int64]
-) -> ScanWriter:
+def _make_object_writer(bag: BagWriter, tracks: Sequence[Mover], stamp_ns: Int64) -> ScanWriter:
     """A function that writes the markers at a scan; the scans (T,) come in order.
 
     Each message begins with a marker that removes the earlier ones.

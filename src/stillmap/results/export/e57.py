@@ -102,10 +102,7 @@ def _write_scan(
 
 
 def _write_points(
-    writer: Any,
-    values: list[Float],
-    cloud: Cloud,
-    progress: Callable[[float], None] | None,
+    writer: Any, values: list[Float], cloud: Cloud, progress: Callable[[float], None] | None
 ) -> tuple[str, Float, Float]:
     """Write all points through the buffers `values`; their digest, and their bounds (3,), (3,)."""
     digest, low, high = hashlib.sha256(), np.full(3, np.inf), np.full(3, -np.inf)

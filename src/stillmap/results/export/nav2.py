@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, write_text
 from stillmap.pipeline.options import MapMode
@@ -16,8 +17,6 @@ from stillmap.results.export.zones import Action, SpeedLimit, Zone, cells_inside
 from stillmap.results.map_server import write_keepout_mask, write_map_server, write_speed_mask
 from stillmap.results.reader import Crossings, Grid
 from stillmap.results.report.template import render
-
-Mask = NDArray[np.bool_]
 
 _TRAFFIC = "traffic"  # where the limit of the slow squares comes from
 
@@ -105,7 +104,7 @@ class Maps:
     """
 
     map: Grid
-    keepout: Mask | None = None
+    keepout: Bool | None = None
     speed: NDArray[np.uint8] | None = None
     code: MaskCode = NO_LIMITS
     warnings: list[str] = field(default_factory=list)
@@ -162,7 +161,7 @@ def make_maps(
     return maps
 
 
-def _cells_of_squares(squares: Mask, crossings: Crossings, grid: Grid) -> Mask:
+def _cells_of_squares(squares: Bool, crossings: Crossings, grid: Grid) -> Bool:
     """(H, W) cells of the map whose centres lie in squares that are true."""
     inside, index = [], []
     for axis, cells, n in zip((1, 0), grid.p_occupied.shape, squares.shape, strict=True):
@@ -188,7 +187,7 @@ def _add_zone(maps: Maps, zone: Zone) -> None:
     _edit(maps, zone, cells)
 
 
-def _edit(maps: Maps, zone: Zone, cells: Mask) -> None:
+def _edit(maps: Maps, zone: Zone, cells: Bool) -> None:
     """Do with cells (H, W) what a zone says."""
     if zone.action in ("erase", "block"):
         maps.map.p_occupied[cells] = float(zone.action == "block")

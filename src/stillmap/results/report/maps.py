@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float32
 from stillmap.core.grid_map import GridMap
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.options import MapMode
@@ -84,7 +85,7 @@ def draw_written_map(occupancy: GridMap, mode: MapMode) -> WrittenMap:
     return WrittenMap(color_by_index(pixels, ((grey,) * 3 for grey in greys)), window, factor)
 
 
-def _reduce_states(p_occupied: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
+def _reduce_states(p_occupied: Float32, factor: int) -> NDArray[np.uint8]:
     """0: a cell of the square is occupied, 2: at least half of its known cells are free, else 1."""
     states = trinary_pixels(p_occupied)
     occupied, free = states == OCCUPIED, states == FREE

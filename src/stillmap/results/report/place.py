@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float
 from stillmap.core.grid_map import GridMap
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import MapMode
@@ -36,8 +37,6 @@ from stillmap.results.timeline import (
     format_date_time,
     read_timeline,
 )
-
-Float = NDArray[np.float64]
 
 _MAX_PATH_POINTS = 1000  # of a session
 _THUMBNAIL_PIXELS = 60_000  # 300 x 200, about 5 kB as PNG
@@ -118,11 +117,7 @@ def _heading(T: Float) -> float:
 
 
 def _map_data(
-    folder: Path,
-    timeline: Timeline,
-    occupancy: GridMap,
-    mode: MapMode,
-    pictures: "PlacePictures",
+    folder: Path, timeline: Timeline, occupancy: GridMap, mode: MapMode, pictures: "PlacePictures"
 ) -> dict[str, Any]:
     """The map as written with the trajectories."""
     view = pictures.view
@@ -137,7 +132,7 @@ def _map_data(
 def _path_data(folder: Path, one: PlaceSession, number: int, view: MapView) -> dict[str, Any]:
     _, poses = read_tum(folder / "sessions" / one.name / "trajectory.tum")
     every = max(1, math.ceil(len(poses) / _MAX_PATH_POINTS))
-    points: NDArray[np.float64] = poses[::every, :2, 3]
+    points: Float = poses[::every, :2, 3]
     return {
         "points": view.svg_points(points),
         "start": view.to_pixels(points[:1])[0].tolist(),

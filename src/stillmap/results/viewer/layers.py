@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import sample_indices
 from stillmap.mesh.texture import GRAY
 from stillmap.results import gltf
@@ -137,7 +138,7 @@ class Layers:
         for name, cloud in self.clouds.items():
             self._points[name][0].colors = self._cloud_colors(name, cloud, by)
 
-    def pick(self, ray: Ray, tangent: float) -> NDArray[np.float64] | None:
+    def pick(self, ray: Ray, tangent: float) -> Float | None:
         """The visible point (3,) that a ray meets, relative to the scene's origin; else the map's.
 
         Args:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import sample_indices
 from stillmap.io.trajectory import quaternion_from_pose
 from stillmap.results.report.template import render_part
@@ -21,7 +22,6 @@ _EXTENT_QUANTILES = (0.03, 0.97)  # of the points, without far outliers
 _DIRECTION_3D = np.array([-0.45, -0.7, 0.62])  # from the scene to the camera
 _SCALE_3D = 0.95  # of the height: what lies behind the center appears smaller
 _MIN_EXTENT = 5.0  # m
-Float = NDArray[np.float64]
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 _LAYER_STEP = 0.02  # m between the map and what is drawn on it in 2D
 

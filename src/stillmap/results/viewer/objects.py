@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import sample_indices
 from stillmap.io.trajectory import quaternion_from_pose
 from stillmap.results.colors import color_by_id
@@ -14,7 +15,6 @@ from stillmap.results.objects import interpolate_pose
 from stillmap.results.reader import Track
 from stillmap.results.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path
 
-Float = NDArray[np.float64]
 # the unit cube: bits 0 to 2 of a corner are its side in x, y, z
 _CORNERS = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5
 _EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
@@ -28,7 +29,6 @@ from stillmap.results.timeline import Timeline, read_timeline
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
 
-Float = NDArray[np.float64]
 MAX_POINTS: dict[Part, int] = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
 _MAX_MODELS = 256 << 20  # bytes of all object models
@@ -52,7 +52,7 @@ class Points(NamedTuple):
         colors: (n, 3) uint8; None where the file has none.
     """
 
-    points: NDArray[np.float32]
+    points: Float32
     colors: NDArray[np.uint8] | None
 
 
@@ -103,7 +103,7 @@ class Scene:
 
     name: str
     folder: str
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Int64
     poses: Float
     map_image: MapImage | None
     clouds: dict[str, Points]
@@ -254,13 +254,11 @@ class Beams:
     """
 
     recording: Recording
-    p_static: NDArray[np.float32]
-    poses: NDArray[np.float64]
+    p_static: Float32
+    poses: Float
     slam: SlamOptions
 
-    def scan_view(
-        self, scan: int, max_count: int = MAX_BEAMS
-    ) -> tuple[Float, NDArray[np.float32], Float]:
+    def scan_view(self, scan: int, max_count: int = MAX_BEAMS) -> tuple[Float, Float32, Float]:
         """At most `max_count` returns of a scan; reads only this scan and its neighbors.
 
         Returns:
