@@ -25,21 +25,14 @@ from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
+from stillmap.places import place_map, store
 from stillmap.places.changes import PlaceChange, detect_place_changes
 from stillmap.places.grow import estimate_planar
 from stillmap.places.keyframes import join_keyframes
 from stillmap.places.objects import write_objects
 from stillmap.places.place import Place, PlacedSession, fit_alignment, join_constraints
-from stillmap.places.place_map import (
-    ShownState,
-    changed_cell_table,
-    label_session,
-    make_place_map,
-    show_state,
-)
 from stillmap.places.place_states import PlaceStates, estimate_place
-from stillmap.places.store import STATE, TIES, read_beam_cells, write_joined_beams, write_ties
-from stillmap.results.map_server import write_map_npz, write_map_server
+from stillmap.results import map_server
 from stillmap.results.point_cloud import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, count_labels, read_labels
@@ -72,8 +65,8 @@ class PlaceResult(ShortRepr):
     refusals: list[PlaceSession]
     order: list[str]
     changes: list[PlaceChange]
-    shown: ShownState
-    planar: ShownState
+    shown: place_map.ShownState
+    planar: place_map.ShownState
 
 
 def finish_place(
@@ -93,12 +86,14 @@ def finish_place(
     limit = _find_limit(place, map_state)
     planar_states = estimate_planar(place)
     planar_states, planar_changes = detect_place_changes(planar_states)
-    planar = show_state(planar_states, planar_changes, limit)
+    planar = place_map.show_state(planar_states, planar_changes, limit)
     if place.dimension == 2:
         return PlaceResult(place, refusals, order, planar_changes, planar, planar)
     states = estimate_place([placed.require_evidence()[0] for placed in place.in_time()])
     states, changes = detect_place_changes(states)
-    return PlaceResult(place, refusals, order, changes, show_state(states, changes, limit), planar)
+    return PlaceResult(
+        place, refusals, order, changes, place_map.show_state(states, changes, limit), planar
+    )
 
 
 def require_map_state(map_state: str, names: Sequence[str]) -> None:
@@ -165,13 +160,13 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         )
         write_clouds(folder, joined, shift_poses(poses, by.metres), labels, origin=by.metres)
     planar = [placed.require_evidence()[1] for placed in place.in_time()]
-    occupancy = make_place_map(planar, result.planar)
+    occupancy = place_map.make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)
     # labels are not rated: keyframes are too far apart for that
     record["quality"] = quality_record(rate_geometry(joined, poses, occupancy))
     occupancy = shift(occupancy, by, FIELDS)
-    write_map_server(folder, occupancy, options.output.map_mode)
-    write_map_npz(folder / "map.npz", occupancy)
+    map_server.write_map_server(folder, occupancy, options.output.map_mode)
+    map_server.write_map_npz(folder / "map.npz", occupancy)
     page = render_place_report(folder, occupancy, options.output.map_mode, record)
     write_text(folder / "report.html", page)
     write_json(folder / RECORD, record)
@@ -219,10 +214,12 @@ def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, tim
     place, home = result.place, folder / "sessions" / placed.session.name
     poses = shift_poses(placed.poses, place.home.origin)
     write_tum(home / "trajectory.tum", placed.session.stamp_ns, poses)
-    beams = read_beam_cells(home, placed.session, place.voxel_size)
+    beams = store.read_beam_cells(home, placed.session, place.voxel_size)
     centres = beams.place_centres(placed.session.node_poses, placed.nodes)
-    write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
-    write_arrays(home / STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
+    write_npy(
+        home / "beams" / "p_static.npy", place_map.label_session(result.shown, beams, centres, time)
+    )
+    write_arrays(home / store.STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
 
 
 def _to_map_frame(place: Place) -> Shift:
@@ -245,7 +242,7 @@ def _between_maps(placed: PlacedSession, by: Shift, T: Float | None = None) -> F
     return shift_poses(T, by.metres)
 
 
-def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
+def _label_keyframes(placed: PlacedSession, shown: place_map.ShownState) -> Float32:
     """(M,) P(static) of the beams of a session's keyframes, as the map shows the place."""
     keyframes = placed.session.keyframes
     beams = np.flatnonzero(keyframes.recording.hit)
@@ -266,15 +263,15 @@ def _write_place_files(folder: Path, result: PlaceResult) -> None:
     with (folder / "trajectory.tum").open("wb") as file:
         for home in homes:
             file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
-    write_joined_beams(folder / "beams", homes)
+    store.write_joined_beams(folder / "beams", homes)
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))
     write_json(folder / CHANGES, _change_records(shift(result.changes, by, _FIELDS), names))
     write_npz(folder / "changes.npz", _change_cells(result.changes, result.shown.place, by))
-    states = changed_cell_table(result.planar, names)
+    states = place_map.changed_cell_table(result.planar, names)
     states["cells"] = (states["cells"] + by.cells[:2]).astype(np.int32)
     write_npz(folder / STATES, states)
-    write_ties(folder / TIES, place.ties, place.dimension)
+    store.write_ties(folder / store.TIES, place.ties, place.dimension)
 
 
 def _join_graphs(place: Place) -> PoseGraph:

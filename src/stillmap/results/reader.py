@@ -9,14 +9,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from stillmap.core import se2
-from stillmap.core.array_folder import (
-    parse,
-    read_array,
-    read_npz,
-    read_probabilities,
-    read_record,
-)
+from stillmap.core import array_folder, se2
+from stillmap.core.array_folder import parse, read_array
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
@@ -130,7 +124,7 @@ def read_labels(result: Path) -> Labels:
     beams = int(offset[-1])
     if offset[0] != 0 or np.any(offset[1:] < offset[:-1]):
         raise InputError("does not rise from 0", where=str(folder / "offset.npy"))
-    p_static = read_probabilities(folder / "p_static.npy", beams)
+    p_static = array_folder.read_probabilities(folder / "p_static.npy", beams)
     return Labels(stamp_ns, offset, p_static, read_array(folder / "hit.npy", (beams,), np.bool_))
 
 
@@ -231,7 +225,9 @@ def _find_map(result: Path) -> Path:
 def _read_layer(path: Path, name: str, kinds: str) -> tuple[NDArray[Any], Origin, float]:
     """A layer (H, W) of one of these kinds of types, the origin (x, y, yaw) of its lower-left
     corner, and its resolution."""
-    layer, origin, edge = read_npz(path, (name, "origin", "resolution"), _MAX_MAP).values()
+    layer, origin, edge = array_folder.read_npz(
+        path, (name, "origin", "resolution"), _MAX_MAP
+    ).values()
     if layer.ndim != 2 or layer.dtype.kind not in kinds:
         hint = "maps are in the plane"
         raise InputError(f"{name} is {layer.shape} {layer.dtype}", where=str(path), hint=hint)
@@ -361,6 +357,6 @@ def read_run(result: Path) -> dict[str, Any]:
         InputError: it is missing or damaged.
     """
     path = result / RECORD
-    record = read_record(path, HINT)
+    record = array_folder.read_record(path, HINT)
     parse(record, _Run, path)
     return record

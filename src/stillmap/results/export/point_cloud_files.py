@@ -10,18 +10,9 @@ import numpy as np
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE, open_las_writer
+from stillmap.results import point_cloud
 from stillmap.results.export import e57
-from stillmap.results.point_cloud import (
-    COLOURS,
-    FIELDS,
-    PACKED_COLOUR,
-    Block,
-    Cloud,
-    Fields,
-    cloud_fields,
-    make_vertices,
-    ply_header,
-)
+from stillmap.results.point_cloud import Block, Cloud, make_vertices
 
 Progress = Callable[[float], None]
 
@@ -91,12 +82,12 @@ def write(cloud: Cloud, path: Path, file_format: Format, progress: Progress | No
 
 
 def _write_ply(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = cloud_fields(cloud, COLOURS)
-    _write_records(cloud, path, ply_header(fields, cloud.count), fields, progress)
+    fields = point_cloud.cloud_fields(cloud, point_cloud.COLOURS)
+    _write_records(cloud, path, point_cloud.ply_header(fields, cloud.count), fields, progress)
 
 
 def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = cloud_fields(cloud, PACKED_COLOUR)
+    fields = point_cloud.cloud_fields(cloud, point_cloud.PACKED_COLOUR)
     names = [name for name, _ in fields]
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
@@ -116,7 +107,7 @@ def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> 
 
 
 def _write_records(
-    cloud: Cloud, path: Path, header: bytes, fields: Fields, progress: Progress | None
+    cloud: Cloud, path: Path, header: bytes, fields: point_cloud.Fields, progress: Progress | None
 ) -> None:
     with path.open("wb") as file:
         file.write(header)
@@ -125,7 +116,12 @@ def _write_records(
 
 
 def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    names = [name for name, _ in (FIELDS + COLOURS if cloud.has_colors else FIELDS)]
+    names = [
+        name
+        for name, _ in (
+            point_cloud.FIELDS + point_cloud.COLOURS if cloud.has_colors else point_cloud.FIELDS
+        )
+    ]
     line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.has_colors else "") + "\n"
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")

@@ -10,15 +10,8 @@ from stillmap.core.json import to_jsonable
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
+from stillmap.results.report import maps
 from stillmap.results.report.estimation import calibration_data, convergence_data
-from stillmap.results.report.maps import (
-    changes_data,
-    draw_dynamic,
-    draw_filtered_map,
-    evolution_data,
-    map_data,
-    objects_data,
-)
 from stillmap.results.report.point_view import points_data
 from stillmap.results.report.template import render_page
 from stillmap.results.run_json import models_record, tilting_record
@@ -60,7 +53,7 @@ def render_report(
         models: of the place and of moving objects.
         folder: the result folder, to whose files the page links; None: no links.
     """
-    figure, recording = draw_filtered_map(result), result.recording
+    figure, recording = maps.draw_filtered_map(result), result.recording
     findings = [split_advice(text) for text in result.warnings]
     data = {
         "result": result,
@@ -72,16 +65,16 @@ def render_report(
         "notes": [what for what, todo in findings if not todo],
         "quality": describe_quality(result.quality),
         "files": files_data(folder),
-        "maps": figure and map_data(result, *figure),
-        "changes": figure and changes_data(result, figure[0]),
-        "objects": figure and objects_data(result, *figure),
+        "maps": figure and maps.map_data(result, *figure),
+        "changes": figure and maps.changes_data(result, figure[0]),
+        "objects": figure and maps.objects_data(result, *figure),
         "points": points_data(result, tilting),
         "rig": None if tilting is None else tilting_record(tilting),
-        "rig_dynamic": figure and tilting and draw_dynamic(tilting, figure[0]),
+        "rig_dynamic": figure and tilting and maps.draw_dynamic(tilting, figure[0]),
         "models": None if models is None else models_record(models),
         "calibration": calibration_data(result),
         "convergence": convergence_data(result),
-        "evolution": evolution_data(result),
+        "evolution": maps.evolution_data(result),
         "options": [(one.name, one.value) for one in iter_options(result.options)],
     }
     return render_page(data)

@@ -16,16 +16,8 @@ from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.snapshots import Window, extent
 from stillmap.results.colors import KIND_COLORS, color_by_id
-from stillmap.results.report.figures import (
-    MAX_PIXELS,
-    UNKNOWN_LEVEL,
-    MapView,
-    color_levels,
-    data_uri,
-    map_levels,
-    map_window,
-    reduction_factor,
-)
+from stillmap.results.report import figures
+from stillmap.results.report.figures import MapView, data_uri
 from stillmap.results.report.maps import written_map_data
 from stillmap.results.report.page import files_data
 from stillmap.results.report.template import render_page
@@ -58,7 +50,7 @@ _FILES = {
 _FONT_SHARE, _PAD_SHARE = 1 / 45, 1 / 160  # of the longer edge of the view
 _LABEL_SHARE = 0.06  # of the width, which a label takes at most
 _OCCUPIED_LEVEL = 100
-_CAME, _LEFT, _CLEAR = UNKNOWN_LEVEL + 2, UNKNOWN_LEVEL + 3, UNKNOWN_LEVEL + 4
+_CAME, _LEFT, _CLEAR = (figures.UNKNOWN_LEVEL + k for k in (2, 3, 4))
 _MARGIN = 8  # cells around changed cells that a picture shows at least
 
 
@@ -177,7 +169,9 @@ class PlacePictures:
         view: window and size of the pictures.
     """
 
-    def __init__(self, occupancy: GridMap, timeline: Timeline, max_pixels: int = MAX_PIXELS):
+    def __init__(
+        self, occupancy: GridMap, timeline: Timeline, max_pixels: int = figures.MAX_PIXELS
+    ):
         """Draw the map as it was written.
 
         Args:
@@ -187,11 +181,11 @@ class PlacePictures:
         """
         cells, self._timeline = timeline.cells, timeline
         window = _window_of(occupancy, timeline)
-        factor = reduction_factor(window, occupancy.resolution, max_pixels)
+        factor = figures.reduction_factor(window, occupancy.resolution, max_pixels)
         at = np.floor((cells.centers - np.array(window[:2])) / occupancy.resolution)
         local = at.astype(np.int64)
-        self._levels = map_levels(occupancy, window, max_pixels=max_pixels)
-        self._cleared = map_levels(occupancy, window, local, max_pixels)
+        self._levels = figures.map_levels(occupancy, window, max_pixels=max_pixels)
+        self._cleared = figures.map_levels(occupancy, window, local, max_pixels)
         height, width = self._levels.shape
         self.view = MapView(window, (width, height), factor)
         row, column = height - 1 - local[:, 1] // factor, local[:, 0] // factor
@@ -201,12 +195,12 @@ class PlacePictures:
 
     def draw_map(self) -> Image.Image:
         """The map as it was written."""
-        return color_levels(self._levels)
+        return figures.color_levels(self._levels)
 
     def draw(self, session: int) -> Image.Image:
         """The map as of a session, in color what came and left since the one before."""
         colors = KIND_COLORS["appeared"], KIND_COLORS["gone"]
-        return color_levels(self._levels_as_of(session), *colors)
+        return figures.color_levels(self._levels_as_of(session), *colors)
 
     def draw_difference(self, session: int) -> tuple[int, int, Image.Image] | None:
         """The difference of `draw` of a session from `draw_map`, transparent elsewhere, after
@@ -218,7 +212,9 @@ class PlacePictures:
         rows, columns = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))
         part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         pixels = np.where(differs, levels, np.uint8(_CLEAR))[part]
-        image = color_levels(pixels, KIND_COLORS["appeared"], KIND_COLORS["gone"], (0, 0, 0))
+        image = figures.color_levels(
+            pixels, KIND_COLORS["appeared"], KIND_COLORS["gone"], (0, 0, 0)
+        )
         image.info["transparency"] = _CLEAR
         return int(columns[0]), int(rows[0]), image
 
@@ -240,7 +236,7 @@ class PlacePictures:
 
 def _window_of(occupancy: GridMap, timeline: Timeline) -> Window:
     """The window of the map, widened by changed cells at its border."""
-    x0, y0, x1, y1 = map_window([occupancy])
+    x0, y0, x1, y1 = figures.map_window([occupancy])
     cells, whole = timeline.cells, extent(occupancy)
     if not len(cells.cells):
         return x0, y0, x1, y1
