@@ -255,6 +255,6 @@ def print_summary(
 
 
 def _describe_hits(recording: Recording, p_static: Float32) -> str:
-    counts = count_beams(recording, p_static)
+    counts = count_beams(recording.hit, p_static)
     share = 100.0 * counts["dynamic"] / max(counts["hits"], 1)
     return f"{counts['hits']} beams that hit something, {share:.1f} % of them dynamic"

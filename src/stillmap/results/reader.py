@@ -17,7 +17,6 @@ from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
-from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.trajectory import MAX_TRANSLATION
 
 Origin = tuple[float, float, float]
@@ -118,30 +117,23 @@ def read_labels(result: Path) -> Labels:
     Raises:
         InputError: files are missing, damaged, or of inconsistent lengths.
     """
+    stamp_ns, offset, hit = read_beams(result)
+    p_static = array_folder.read_probabilities(result / "beams" / "p_static.npy", len(hit))
+    return Labels(stamp_ns, offset, p_static, hit)
+
+
+def read_beams(result: Path) -> tuple[Int64, Int64, Bool]:
+    """`stamp_ns`, `offset` and `hit` of `Labels`.
+
+    Raises:
+        InputError: files are missing, damaged, or of inconsistent lengths.
+    """
     folder = result / "beams"
     stamp_ns = read_array(folder / "stamp_ns.npy", (None,), np.int64)
     offset = read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64)
-    beams = int(offset[-1])
     if offset[0] != 0 or np.any(offset[1:] < offset[:-1]):
         raise InputError("does not rise from 0", where=str(folder / "offset.npy"))
-    p_static = array_folder.read_probabilities(folder / "p_static.npy", beams)
-    return Labels(stamp_ns, offset, p_static, read_array(folder / "hit.npy", (beams,), np.bool_))
-
-
-def count_labels(hit: Bool, p_static: Float32) -> dict[str, int]:
-    """`beams`, `hits`, `max_range`, `unusable` and `dynamic` of labels (M,)."""
-    hits = dynamic = unusable = 0
-    for block in iter_blocks(hit, p_static):
-        hits += int(np.count_nonzero(hit[block]))
-        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
-        unusable += int(np.count_nonzero(np.isnan(p_static[block])))
-    return {
-        "beams": len(hit),
-        "hits": hits,
-        "max_range": len(hit) - hits - unusable,
-        "unusable": unusable,
-        "dynamic": dynamic,
-    }
+    return stamp_ns, offset, read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
 
 
 def read_colors(result: Path, beams: int) -> NDArray[np.uint8] | None:
@@ -333,20 +325,13 @@ def _to_track(one: _Object) -> Track:
 
 
 @dataclass(frozen=True)
-class _Quality:
-    overall: float | None = None
-    labels: float | None = None
-    geometry: float | None = None
-
-
-@dataclass(frozen=True)
 class _Run:
     """The entries of `run.json` that are read."""
 
     input: dict[str, Any]
     options: dict[str, Any] | None = None
     warnings: list[str] | None = None
-    quality: _Quality | None = None
+    quality: dict[str, float | None] | None = None
     dimension: int | None = None
 
 

@@ -11,6 +11,7 @@ from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.array_types import Bool
 from stillmap.core.config import to_dict
 from stillmap.core.files import package_version
+from stillmap.core.grid_map import GridMap
 from stillmap.core.json import to_jsonable
 from stillmap.core.recording import Recording
 from stillmap.core.tiles import tiles_of
@@ -35,7 +36,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         result: the mapped recording.
         more: further keys and their values.
     """
-    counts = count_beams(result.recording, result.p_static)
+    counts = count_beams(result.recording.hit, result.p_static)
     record = {
         "format_version": FORMAT_VERSION,
         "version": package_version(),
@@ -49,7 +50,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             for key in ("seconds", "cpu_seconds", "peak_memory_bytes")
         },
         "counts": _counts(result.recording, counts),
-        "area": known_area(result),
+        "area": {"known": known_area(result.map), "thin": thin_area(result)},
         "warnings": list(result.warnings),
         "quality": quality_record(result.quality),
         "learned": result.learned,
@@ -98,18 +99,23 @@ def quality_record(quality: Quality) -> dict[str, float | None]:
     return {name: getattr(quality, name) for name in ("overall", "labels", "geometry")}
 
 
-def known_area(result: MappingResult) -> dict[str, float]:
-    """`known`: m2 of the map of which beams tell something; `thin`: of these on thin evidence."""
-    cell = float(result.map.resolution) ** 2
-    layers = tiles_of(result.map.p_occupied), tiles_of(result.evidence.thinly_observed)
-    known = sum(int(np.count_nonzero(~np.isnan(part))) for _, part in layers[0])
-    thin = sum(int(np.count_nonzero(part)) for _, part in layers[1])
-    return {"known": round(cell * known, 6), "thin": round(cell * thin, 6)}
+def known_area(occupancy: GridMap) -> float:
+    """m2 of a map of which beams tell something."""
+    parts = tiles_of(occupancy.p_occupied)
+    known = sum(int(np.count_nonzero(~np.isnan(part))) for _, part in parts)
+    return round(float(occupancy.resolution) ** 2 * known, 6)
+
+
+def thin_area(result: MappingResult) -> float:
+    """m2 of the map that are known on thin evidence."""
+    parts = tiles_of(result.evidence.thinly_observed)
+    thin = sum(int(np.count_nonzero(part)) for _, part in parts)
+    return round(float(result.map.resolution) ** 2 * thin, 6)
 
 
 def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
     """The `tilting` entry of `run.json`."""
-    counts = count_beams(tilting.deskewed, tilting.p_static)
+    counts = count_beams(tilting.deskewed.hit, tilting.p_static)
     return {
         "input": tilting.recording.source.to_dict(),
         "counts": _counts(tilting.recording, counts, left_out=tilting.unposed_beams),

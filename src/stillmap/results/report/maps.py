@@ -17,7 +17,7 @@ from stillmap.pipeline.snapshots import Snapshot, Window, extent
 from stillmap.results.map_server import CHANGED, changed_cells, trinary_pixels
 from stillmap.results.report import figures
 from stillmap.results.report.figures import MapView, data_uri
-from stillmap.results.run_json import known_area
+from stillmap.results.run_json import known_area, thin_area
 from stillmap.tracking import FlowMap
 from stillmap.tracking.objects import mean_speed, track_length
 
@@ -99,7 +99,7 @@ def draw_filtered_map(result: MappingResult) -> tuple[MapView, Image.Image] | No
 
 def map_data(result: MappingResult, view: MapView, filtered: Image.Image) -> dict[str, Any]:
     """The map as written, and the raw one beside the filtered one (Figs. 4, 6, 7)."""
-    thin, area = result.evidence.thinly_observed, known_area(result)
+    thin = result.evidence.thinly_observed
     every = max(1, math.ceil(len(result.poses) / _MAX_PATH_POINTS))
     return {
         **written_map_data(result.map, result.options.output.map_mode, view),
@@ -108,8 +108,8 @@ def map_data(result: MappingResult, view: MapView, filtered: Image.Image) -> dic
         "dynamic": draw_dynamic(result, view),
         "thinly_observed": data_uri(figures.draw_thinly_observed(result.map, thin, view.window)),
         "path": view.svg_points(result.poses[::every, :2, -1]),
-        "known_area": area["known"],
-        "thinly_observed_area": area["thin"],
+        "known_area": known_area(result.map),
+        "thinly_observed_area": thin_area(result),
         "min_observations": result.evidence.min_observations,
         "radius": result.evidence.mover_radius,
     }
