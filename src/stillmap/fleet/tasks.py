@@ -213,9 +213,9 @@ def _replace_in_files(folder: Path, texts: dict[str, str]) -> None:
     """Replace paths, which need no escapes, in the JSON and HTML files of a result."""
     for path in folder.rglob("*"):
         if path.suffix in (".json", ".html") and path.is_file():
-            escape = html.escape if path.suffix == ".html" else _escape_json
-            text = read_text(path, _MAX_BYTES)
-            replaced = _replace(text, {old: escape(new) for old, new in texts.items()})
+            is_html, text = path.suffix == ".html", read_text(path, _MAX_BYTES)
+            escaped = {k: html.escape(v) if is_html else to_json(v)[1:-1] for k, v in texts.items()}
+            replaced = _replace(text, escaped)
             if replaced != text:
                 write_text(path, replaced)
 
@@ -224,10 +224,6 @@ def _replace(text: str, texts: dict[str, str]) -> str:
     for old, new in texts.items():
         text = text.replace(old, new)
     return text
-
-
-def _escape_json(text: str) -> str:
-    return to_json(text)[1:-1]
 
 
 def _summarize(folder: Path) -> dict[str, Any]:

@@ -157,8 +157,7 @@ def _add_all(
                 why = f"it is in {session.dimension}D, the place in {place.dimension}D"
             else:
                 report = prefix_steps(progress, session.name)
-                growth = add_session(place, session, threads, report)
-                place, why = growth.place, growth.refused
+                place, why = add_session(place, session, threads, report)
             if why:
                 refusals[session.name] = PlaceSession(session.name, session.input, False, why)
             else:

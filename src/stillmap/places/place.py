@@ -224,19 +224,11 @@ def _measure(placed: PlacedSession, place: Place, limit: float, threads: int) ->
     return replace(placed, evidence=(evidence, planar), measured_at=poses)
 
 
-def estimate_covariance(placed: PlacedSession, ties: Sequence[Tie]) -> Float:
-    """Covariance of the alignment of a session, at its first scan and in its frame.
+def combine_covariances(poses: Float, covariances: Sequence[Float]) -> Float:
+    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance.
 
     (3, 3) of x, y, heading; (6, 6) of translation and rotation vector in 3D.
     """
-    poses = se2.inverse(placed.session.node_poses[0]) @ placed.session.node_poses
-    return combine_covariances(
-        poses[[tie.second_node for tie in ties]], [tie.covariance for tie in ties]
-    )
-
-
-def combine_covariances(poses: Float, covariances: Sequence[Float]) -> Float:
-    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance."""
     D = poses.shape[-1] - 1
     information: Float = 1e-9 * np.eye(3 * (D - 1))
     for pose, covariance in zip(poses, covariances, strict=True):

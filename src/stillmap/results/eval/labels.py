@@ -79,6 +79,7 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
         raise ValueError("p_static: probabilities must lie in [0, 1]")
     y = ~static[labelled]
     q = 1.0 - p
+    clipped = np.clip(q, LOG_LOSS_EPS, 1.0 - LOG_LOSS_EPS)
     unsure = (q > UNSURE[0]) & (q < UNSURE[1])
     bins_unsure = assign_equal_mass_bins(q[unsure])
     precision, recall, f1 = compute_precision_recall_f1(p < 0.5, y)
@@ -92,7 +93,7 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
         recall=recall,
         f1=f1,
         brier=mean((q - y) ** 2),
-        log_loss=compute_log_loss(q, y),
+        log_loss=mean(-np.log(np.where(y, clipped, 1.0 - clipped))),
         ece=compute_calibration_error(q, y, assign_equal_width_bins(q)),
         unsure=int(unsure.sum()),
         ece_unsure=compute_calibration_error(q[unsure], y[unsure], bins_unsure),
@@ -125,12 +126,6 @@ def compute_precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, fl
         both / n_positive if n_positive else NAN,
         2 * both / (n_called + n_positive) if n_called + n_positive else NAN,
     )
-
-
-def compute_log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> float:
-    """Mean of -ln P(truth), in nats, P clipped to [eps, 1 - eps]."""
-    p = np.clip(p, eps, 1.0 - eps)
-    return mean(-np.log(np.where(positive, p, 1.0 - p)))
 
 
 def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> Index:

@@ -273,11 +273,9 @@ class Beams:
         beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
         use = np.flatnonzero(near.hit[at])
         use = use[sample_indices(len(use), max_count)]
-        T_map_sensor = near.T_map_sensor(self.poses[first:end])[scan - first]
         ends, origin = np.zeros((len(use), 3)), np.zeros(3)
-        points = near.points[at][use].astype(np.float64)
-        ends[:, :D] = points @ T_map_sensor[:D, :D].T + T_map_sensor[:D, D]
-        origin[:D] = T_map_sensor[:D, D]
+        ends[:, :D] = near.end_points(at.start + use, self.poses[first:end])
+        origin[:D] = near.T_map_sensor(self.poses[first:end])[scan - first, :D, D]
         p_static = np.asarray(self.p_static[beams][use])
         self.recording.release_pages(self.p_static)
         return ends, p_static, origin
