@@ -133,11 +133,7 @@ def read_tum(path: Path) -> tuple[Int64, Float]:
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    try:
-        text = read_text(path, MAX_BYTES)
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=str(path)) from error
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path, MAX_BYTES).splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue

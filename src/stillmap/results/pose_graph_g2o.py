@@ -79,7 +79,7 @@ def read_g2o(path: Path) -> PoseGraph:
         InputError: the file is missing or damaged; names the line.
     """
     ids, rows, ends, edges, D = [], list[list[float]](), list[list[int]](), list[list[float]](), 0
-    for number, line in enumerate(_read_lines(path), start=1):
+    for number, line in enumerate(read_text(path, _MAX_BYTES).splitlines(), start=1):
         tag, *words = line.split() or [""]
         try:
             if tag in _VERTEX.values():
@@ -123,13 +123,6 @@ def _to_constraints(
         raise ValueError("the information of an edge is not positive definite")
     parts = zip(index.tolist(), _to_poses(values[:, :n_pose]), covariance, strict=True)
     return [Constraint(first, second, T, part) for (first, second), T, part in parts]
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return read_text(path, _MAX_BYTES).splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError("is damaged: no text", where=str(path)) from error
 
 
 def _floats(words: list[str], count: int) -> list[float]:

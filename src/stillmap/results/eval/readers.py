@@ -229,12 +229,8 @@ def _first_row(path: Path, wanted: str) -> list[str]:
 
 def _rows(path: Path, columns: int, names: str) -> Float:
     """(N, columns) finite numbers; # begins a comment."""
-    try:
-        lines = read_text(path, MAX_BYTES).splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=str(path)) from error
     rows = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path, MAX_BYTES).splitlines(), start=1):
         words = line.split("#")[0].split()
         try:
             row = [float(word) for word in words]
