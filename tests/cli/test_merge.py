@@ -122,7 +122,9 @@ def test_what_is_refused(call, flat_days, flat_place, tmp_path, nothing_left):
         "is no state of a map: new",
         "--map-state last",
     )
-    refused(call("merge", day1, flat_days / "map2", "-o", day1, "--overwrite"), "recording itself")
+    refused(
+        call("merge", day1, flat_days / "map2", "-o", day1, "--overwrite"), "one of the sessions"
+    )
     nothing_left()
     copy = tmp_path / "copy"
     shutil.copytree(flat_place, copy)

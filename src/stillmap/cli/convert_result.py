@@ -7,7 +7,7 @@ from typing import get_args
 from stillmap.cli.arguments import flag_changes, require_apart
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import require_new, require_new_file, workplace
+from stillmap.core.files import require_new_file, workplace
 from stillmap.core.grid_map import limit_hits
 from stillmap.io import writers
 from stillmap.io.ros.messages import BagKind
@@ -63,7 +63,6 @@ def _convert_to_nav2(
         flag = next(iter(_given_zone_flags(args)))
         hint = f"FILE is a folder; if it shall be called so, give --to {NAV2}"
         raise InputError(f"{flag} is for maps and masks of nav2", where=str(output), hint=hint)
-    require_new(output, nav2.PARAMETERS, args.overwrite)
     rule = _traffic_rule(args)
     drawn = zones.read_zones(Path(args.mask)) if args.mask is not None else []
     is_traffic = rule.keepout is not None or rule.slow is not None

@@ -41,14 +41,9 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: an input or the output is at fault, or fewer than two sessions could be placed.
     """
-    from stillmap.core.files import require_new
     from stillmap.places.merge import merge_sessions, plan_merge
-    from stillmap.results.reader import RECORD
 
     options, output = arguments.options_from_args(args), Path(args.output)
-    require_new(output, RECORD, args.overwrite)
-    for path in args.input:
-        arguments.require_apart(output, Path(path))
     job = plan_merge(args.input, options, args.frame, args.map_state, not args.no_odometry)
     with (
         arguments.make_parents(output),

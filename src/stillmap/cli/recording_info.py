@@ -26,7 +26,8 @@ _SENSOR_NOTES = (
 
 def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
-    source, times = recording.source, recording.beam_time
+    source = recording.source
+    has_times = recording.beam_time is not None and recording.n_beams > 0
     notes = to_jsonable(asdict(source))
     return {
         "dimension": recording.dimension,
@@ -37,9 +38,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
         "part": to_jsonable(source.to_dict().get("part") or {}),
-        "beam_times_s": [float(times.min()), float(times.max())]
-        if times is not None and len(times)
-        else None,
+        "beam_times_s": list(recording.beam_time_span) if has_times else None,
         "spin": None if source.spin is None else source.spin.direction,
         "odometry": _summarize_odometry(recording, source.odometry),
         "recorded_poses": _summarize_path(recording.T_recorded_base),

@@ -133,7 +133,7 @@ def select_box_beams(
     """
     ends = _end_points(posed)
     seconds = 1e-9 * (recording.stamp_ns - start_ns)
-    early, late = _beam_time_span(recording)
+    early, late = recording.beam_time_span
     out = []
     for box in boxes:
         first = int(np.searchsorted(seconds, box.seconds[0] - box.hold - late))
@@ -177,15 +177,6 @@ def _end_points(posed: PosedRecording) -> Float32:
         ends[block] = np.nan
         ends[hits] = scans.end_points(hits, posed.poses)
     return ends
-
-
-def _beam_time_span(recording: Recording) -> tuple[float, float]:
-    """Seconds from a scan's stamp to its first and to its last beam, over all scans."""
-    times = recording.beam_time
-    if times is None or not len(times):
-        return 0.0, 0.0
-    parts = [(float(times[b].min()), float(times[b].max())) for b in iter_blocks(times)]
-    return min(low for low, _ in parts), max(high for _, high in parts)
 
 
 def _is_near_path(box: Box, ends: Float32, margin: float) -> Bool:

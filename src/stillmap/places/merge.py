@@ -74,6 +74,7 @@ def merge_sessions(
             sessions could be placed.
     """
     threads = resolve_threads(job.options.threads)
+    _require_apart(output, job)
     with atomic_folder(output, RECORD, overwrite) as folder:
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder, threads)
@@ -239,7 +240,6 @@ def merge(
     job = plan_merge(sessions, to_options(options), frame, map_state, odometry)
     with report_to(progress, job.options.em.max_iterations) as report:
         if output is not None:
-            _require_apart(Path(output), job)
             merge_sessions(job, Path(output), overwrite, report)
             return load(Path(output))
         return _merge_temporarily(job, report)

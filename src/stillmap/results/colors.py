@@ -40,14 +40,11 @@ def color_by_p_static(p_static: Float32) -> Colors:
     return _interpolate_colors(_P_STATIC_COLORS, np.asarray(p_static, np.float64))
 
 
-def color_by_height(z: NDArray[np.floating], low: float, high: float) -> Colors:
-    """Dark blue at `low` to yellow at `high`, for heights z (n,) in m."""
-    return _shade(HEIGHT_COLORS, z, low, high)
-
-
-def color_static(z: NDArray[np.floating], low: float, high: float) -> Colors:
-    """Dark grey at `low` to light grey at `high`, for heights z (n,) in m."""
-    return _shade(STATIC_COLORS, z, low, high)
+def color_by_height(
+    z: NDArray[np.floating], low: float, high: float, stops: Sequence[Rgb] = HEIGHT_COLORS
+) -> Colors:
+    """The first color at `low` to the last one at `high`, for heights z (n,) in m."""
+    return _interpolate_colors(stops, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
 
 
 def color_by_id(number: Index | Sequence[int]) -> Colors:
@@ -56,10 +53,6 @@ def color_by_id(number: Index | Sequence[int]) -> Colors:
     # a cosine per channel, a third of the circle apart
     level = np.cos(2.0 * np.pi * (hue[:, None] - np.array([0.0, 1.0, 2.0]) / 3.0))
     return np.rint(120.0 + 105.0 * level).astype(np.uint8)
-
-
-def _shade(stops: Sequence[Rgb], z: NDArray[np.floating], low: float, high: float) -> Colors:
-    return _interpolate_colors(stops, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
 
 
 def _interpolate_colors(stops: Sequence[Rgb], share: Float) -> Colors:

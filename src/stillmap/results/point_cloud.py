@@ -120,11 +120,7 @@ def cloud_from_recording(
         origin: (3,) of the frame in which the result was computed; None or zero: that of the map.
     """
     times = recording.beam_time
-    earliest = 0.0
-    if times is not None:
-        for block in arrays.iter_blocks(times):
-            earliest = min(earliest, float(times[block].min()))
-    T_map_sensor = deskewed.T_map_sensor(poses)
+    T_map_sensor, earliest = deskewed.T_map_sensor(poses), min(recording.beam_time_span[0], 0.0)
     if origin is None or not origin.any():
         origin = np.round(poses[0, :3, 3])
 

@@ -251,14 +251,12 @@ class Timeline(ShortRepr):
         refused: those that are not in the place.
         changes: in the order of time.
         cells: that changed.
-        map_state: which state the map shows: `last`, `majority`, a session or a date.
     """
 
     sessions: list[PlaceSession]
     refused: list[PlaceSession]
     changes: list[SessionChange]
     cells: ChangedCells
-    map_state: str
 
     def changes_at(self, session: int) -> list[SessionChange]:
         """The changes that a session was the first to see."""
@@ -287,12 +285,8 @@ class Timeline(ShortRepr):
         return now, now & ~before & listed, before & ~now & listed
 
 
-def read_timeline(folder: Path, map_state: str = "last") -> Timeline:
-    """The sessions of a place and what changed between them.
-
-    Args:
-        folder: which `stillmap merge` wrote.
-        map_state: which state its map shows, as `run.json` says it.
+def read_timeline(folder: Path) -> Timeline:
+    """The sessions of a place, which `stillmap merge` wrote, and what changed between them.
 
     Raises:
         InputError: a file is missing, damaged, or was changed by hand.
@@ -305,7 +299,7 @@ def read_timeline(folder: Path, map_state: str = "last") -> Timeline:
         raise InputError(what, where=str(folder / STATES), hint=HINT)
     refused = [one for one in sessions if not one.accepted]
     changes = read_changes(folder, names)
-    return Timeline([accepted[name] for name in names], refused, changes, cells, map_state)
+    return Timeline([accepted[name] for name in names], refused, changes, cells)
 
 
 def format_date_time(stamp_ns: int) -> str:

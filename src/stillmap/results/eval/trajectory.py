@@ -22,7 +22,7 @@ from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.errors import InputError
 from stillmap.io.trajectory import nearest_index
 from stillmap.results.eval import readers
-from stillmap.results.eval.labels import Scores
+from stillmap.results.eval.labels import NAN, Scores
 from stillmap.results.eval.readers import Truth
 
 Unit = Literal["m", "frames"]
@@ -177,13 +177,9 @@ def _angle(R: Float) -> Float:
 def summarize_errors(error: Float) -> ErrorStats:
     """Summary of (N,) errors."""
     if not len(error):
-        return ErrorStats(*[float("nan")] * 4)
-    return ErrorStats(
-        rmse=float(np.sqrt(np.mean(error**2))),
-        mean=float(error.mean()),
-        median=float(np.median(error)),
-        max=float(error.max()),
-    )
+        return ErrorStats(*[NAN] * 4)
+    rmse = np.sqrt(np.mean(error**2))
+    return ErrorStats(*map(float, (rmse, error.mean(), np.median(error), error.max())))
 
 
 def read_paired_poses(result: Path, truth: Truth) -> tuple[Float, Float]:
@@ -293,17 +289,7 @@ def _displacement(a: Float, b: Float) -> Float:
 
 def _summarize(error: Float) -> Spread:
     if not len(error):
-        return Spread(*[float("nan")] * 6)
-    squared = error**2
-    return Spread(
-        mean=float(error.mean()),
-        std=_sample_std(error),
-        squared_mean=float(squared.mean()),
-        squared_std=_sample_std(squared),
-        median=float(np.median(error)),
-        max=float(error.max()),
-    )
-
-
-def _sample_std(values: Float) -> float:
-    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
+        return Spread(*[NAN] * 6)
+    ddof = int(len(error) > 1)  # the deviation of one error is 0
+    spreads = [(values.mean(), values.std(ddof=ddof)) for values in (error, error**2)]
+    return Spread(*map(float, (*spreads[0], *spreads[1], np.median(error), error.max())))

@@ -45,7 +45,6 @@ def write(
         OSError: the file cannot be created.
     """
     library = import_extra("pye57.libe57", path, "written")
-    require_name(path)
     path.open("wb").close()  # raises an OSError that names the reason; libe57 does not
     try:
         file = library.ImageFile(str(path), "w")

@@ -68,7 +68,7 @@ def render_place_report(
     Raises:
         InputError: a file of the place is damaged.
     """
-    timeline = read_timeline(folder, str(record["place"]["map_state"]))
+    timeline = read_timeline(folder)
     numbers = range(len(timeline.sessions))
     pictures = small = None
     if occupancy.p_occupied.size:

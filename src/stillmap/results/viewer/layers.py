@@ -174,8 +174,9 @@ class Layers:
             return colors
         if name == DYNAMIC:
             return np.full((len(cloud.points), 3), palette.ORANGE, np.uint8)
-        color = palette.color_by_height if by == HEIGHT else palette.color_static
-        return color(cloud.points[:, 2] + self._scene.origin[2], *self.heights)
+        z = cloud.points[:, 2] + self._scene.origin[2]
+        stops = palette.HEIGHT_COLORS if by == HEIGHT else palette.STATIC_COLORS
+        return palette.color_by_height(z, *self.heights, stops)
 
     @property
     def _map_height(self) -> float:
