@@ -51,8 +51,7 @@ def read_inputs(args: argparse.Namespace, options: Options, scratch: Path) -> In
         InputError: something cannot be read, or the inputs do not follow each other.
     """
     with show_share(args.quiet, "reading") as progress:
-        source = args.input if len(args.input) > 1 else args.input[0]
-        recording = inputs.read(source, options.read, progress=progress, scratch=scratch)
+        recording = inputs.read(args.input, options.read, progress=progress, scratch=scratch)
     if len(args.input) > 1 and not args.quiet:
         say(f"{len(args.input)} parts of one run, in the order of their stamps")
     if args.no_odometry:

@@ -22,7 +22,6 @@ from stillmap.cli.console import list_files, print_json, say, show_progress
 
 if TYPE_CHECKING:
     from stillmap.places.finish import PlaceResult
-    from stillmap.places.merge import MergeJob
 
 
 FLAGS = f"""
@@ -51,13 +50,13 @@ def run(args: argparse.Namespace) -> int:
     ):
         result = merge_sessions(job, output, args.overwrite, progress)
     if not args.quiet:
-        _print_summary(job, result, output)
+        _print_summary(result, args.map_state, output)
     if args.json:
         print_json(_summarize(result, output))
     return 0
 
 
-def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None:
+def _print_summary(result: "PlaceResult", map_state: str, output: Path) -> None:
     """Print which sessions were placed, what changed, and where the result lies."""
     sessions, ties = result.place.sessions, result.place.ties
     say(f"{len(sessions)} sessions in one map, {len(ties)} constraints between them")
@@ -67,7 +66,7 @@ def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None
     words = {"appeared": "appeared", "gone": "are gone", "moved": "moved", "door": "are doors"}
     counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kind in kinds]
     what = f"{len(kinds)} changes between sessions: {', '.join(counts)}"
-    say(f"{what}; the map shows {job.map_state}" if kinds else "nothing changed between sessions")
+    say(f"{what}; the map shows {map_state}" if kinds else "nothing changed between sessions")
     say(f"wrote {output}")
 
 

@@ -159,8 +159,7 @@ def _prepare_session(
         return keep_session(session, given, given.deskewed, folder, options)
     with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
         if not isinstance(given, Result):
-            source = given[0] if isinstance(given, tuple) and len(given) == 1 else given
-            given = build(source, options, odometry=odometry, progress=report, scratch=scratch)
+            given = build(given, options, odometry=odometry, progress=report, scratch=scratch)
         mapped, recording = Path(scratch) / "result", given.recording
         given.save(mapped)
         del given

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +13,10 @@ from stillmap.core.arrays import write_npz
 from stillmap.core.local_frame import FAR
 from stillmap.io.trajectory import embed_in_3d
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.point_cloud import Fields, coordinate_fields, ply_header
 from stillmap.results.reader import Track
 from stillmap.tracking import FlowMap, MovingObject
-
-if TYPE_CHECKING:
-    from stillmap.pipeline.tilting import TiltingResult
 
 Mover = MovingObject | Track
 
@@ -28,7 +26,7 @@ OBJECT_FIELDS: Fields = [(name, "<f4") for name in ("x", "y", "z", "seconds", "p
 MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
-def write_objects(folder: Path, result: "MappingResult | TiltingResult") -> None:
+def write_objects(folder: Path, result: MappingResult | TiltingResult) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
     objects, recording, p_static = result.objects, result.deskewed, result.p_static
     folder.mkdir()

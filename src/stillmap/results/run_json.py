@@ -19,6 +19,7 @@ from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.objects import MILLIMETRES
 from stillmap.results.reader import LOCAL_ORIGIN
 from stillmap.slam import LoopClosure
@@ -26,7 +27,6 @@ from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.tilting import TiltingResult
 
 
 def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def thin_area(result: MappingResult) -> float:
     return round(float(result.map.resolution) ** 2 * thin, 6)
 
 
-def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
+def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
     """The `tilting` entry of `run.json`."""
     counts = count_beams(tilting.deskewed.hit, tilting.p_static)
     return {

@@ -4,10 +4,8 @@ import logging
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
 from stillmap.core.array_folder import read_array
@@ -38,34 +36,36 @@ class Truth:
         """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
         if self.recording.dimension != 2:
             raise InputError("is not a planar recording", where=str(self.folder))
-        path = self.folder / "truth/walls.npy"
-        walls = _finite(path, read_array(path, (None, 4), np.float64))
+        walls = self._read("walls", (None, 4))
         if not len(walls):
-            raise InputError("holds no walls", where=str(path))
+            raise InputError("holds no walls", where=str(self.folder / "truth/walls.npy"))
         return walls
 
     def lasting(self) -> Float:
         """(K, 4) segments of moved or added objects that are there at the end."""
-        path = self.folder / "truth/lasting.npy"
-        if not path.exists():
+        if not (self.folder / "truth/lasting.npy").exists():
             return np.empty((0, 4))
-        return _finite(path, read_array(path, (None, 4), np.float64))
+        return self._read("lasting", (None, 4))
 
     def poses(self) -> Float:
         """(T, D+1, D+1) T_world_base."""
-        path = self.folder / "truth/T_world_base.npy"
         n = self.recording.dimension + 1
-        return _finite(path, read_array(path, (self.recording.n_scans, n, n), np.float64))
+        return self._read("T_world_base", (self.recording.n_scans, n, n))
 
     def static_hits(self) -> Float:
         """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
         use, recording = np.flatnonzero(self.recording.hit & self.static()), self.recording
-        path = self.folder / "truth/T_base_sensor.npy"
-        if path.exists():  # the recorder was wrong about its mount
-            shape = recording.T_base_sensor.shape
-            T_base_sensor = _finite(path, read_array(path, shape, np.float64))
+        if (self.folder / "truth/T_base_sensor.npy").exists():  # it was wrong about its mount
+            T_base_sensor = self._read("T_base_sensor", recording.T_base_sensor.shape)
             recording = replace(recording, T_base_sensor=T_base_sensor)
         return recording.end_points(use, self.poses())
+
+    def _read(self, name: str, shape: tuple[int | None, ...]) -> Float:
+        path = self.folder / "truth" / f"{name}.npy"
+        array = read_array(path, shape, np.float64)
+        if not np.isfinite(array).all():
+            raise InputError("holds a number that is not finite", where=str(path))
+        return array
 
 
 def read_truth(path: Path, labels: Labels | None = None) -> Truth:
@@ -120,12 +120,6 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
     if differ.any():
         what = f"scan {int(np.argmax(differ))} differs from that in {truth.folder}"
         raise InputError(what, where=where, hint=hint)
-
-
-def _finite(path: Path, array: NDArray[Any]) -> Float:
-    if not np.isfinite(array).all():
-        raise InputError("holds a number that is not finite", where=str(path))
-    return np.asarray(array, np.float64)
 
 
 _RELATION = "t1 t2 x y z roll pitch yaw"

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,13 @@ from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Snapshot, Window, extent
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.map_server import CHANGED, changed_cells, trinary_pixels
 from stillmap.results.report import figures
 from stillmap.results.report.figures import MapView, data_uri
 from stillmap.results.run_json import known_area, thin_area
 from stillmap.tracking import FlowMap
 from stillmap.tracking.objects import mean_speed, track_length
-
-if TYPE_CHECKING:
-    from stillmap.pipeline.tilting import TiltingResult
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # pixels of map.pgm
 _MAX_EDGE = 4096  # pixels; a trinary map of that size takes a few hundred kB as PNG
@@ -115,7 +113,7 @@ def map_data(result: MappingResult, view: MapView, filtered: Image.Image) -> dic
     }
 
 
-def draw_dynamic(result: "MappingResult | TiltingResult", view: MapView) -> str:
+def draw_dynamic(result: MappingResult | TiltingResult, view: MapView) -> str:
     """`data:` URI of the dynamic returns as a layer over the map."""
     ends = sample_points(result.deskewed, result.poses, result.p_static)[:, :2]
     return data_uri(figures.draw_points(ends, view))

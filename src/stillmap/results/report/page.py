@@ -8,12 +8,12 @@ from stillmap.core import config, errors, json
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.report import estimation, maps, point_view, template
 from stillmap.results.run_json import models_record, tilting_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.tilting import TiltingResult
 
 # files beside the report that are linked where they exist, with their content
 _FILES = {
@@ -36,7 +36,7 @@ _NO_MORE: Mapping[str, str] = {}
 
 def render_report(
     result: MappingResult,
-    tilting: "TiltingResult | None" = None,
+    tilting: TiltingResult | None = None,
     models: "Models | None" = None,
     folder: Path | None = None,
 ) -> str:

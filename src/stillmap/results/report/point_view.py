@@ -1,7 +1,7 @@
 """The points of a 3D result in perspective: static ones by height, dynamic ones in orange."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,9 @@ from PIL import Image
 from stillmap.core.array_types import Float, Float32
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.colors import ORANGE, color_by_height
 from stillmap.results.report.figures import data_uri
-
-if TYPE_CHECKING:
-    from stillmap.pipeline.tilting import TiltingResult
-
 
 _SIZE = (1280, 720)  # pixels
 _CENTER = 0.5 * np.array(_SIZE) - 0.5  # pixel centers have integer coordinates
@@ -36,7 +33,7 @@ _MARGIN = 1.05  # around fitted points
 
 
 def points_data(
-    result: MappingResult, tilting: "TiltingResult | None" = None
+    result: MappingResult, tilting: TiltingResult | None = None
 ) -> dict[str, Any] | None:
     """The static points, and the same with dynamic ones, as seen from above and aside.
 
