@@ -13,13 +13,10 @@ from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, write_text
 from stillmap.pipeline.options import MapMode
-from stillmap.results.export.zones import Action, SpeedLimit, Zone, cells_inside, is_within
+from stillmap.results.export.zones import SpeedLimit, Zone, cells_inside, is_within
 from stillmap.results.map_server import write_keepout_mask, write_map_server, write_speed_mask
 from stillmap.results.reader import Crossings, Grid
 from stillmap.results.report.template import render
-
-_TRAFFIC = "traffic"  # where the limit of the slow squares comes from
-
 
 PARAMETERS = "nav2_params.yaml"
 
@@ -77,18 +74,11 @@ class MaskCode(NamedTuple):
 NO_LIMITS = MaskCode.of({})
 
 
-class TrafficRule(NamedTuple):
-    """Zones from traffic: the squares that were crossed at least so often.
+class TrafficZone(NamedTuple):
+    """A zone of the squares that were crossed at least so often; its polygons do not count."""
 
-    Attributes:
-        keepout: crossings from which a square is a keep-out zone; None: none is.
-        slow: crossings from which the speed in a square is limited; None: it is not.
-        limit: of the slow squares.
-    """
-
-    keepout: int | None
-    slow: int | None
-    limit: SpeedLimit
+    least: int
+    zone: Zone
 
 
 @dataclass(eq=False)
@@ -115,7 +105,7 @@ class Maps:
 
 
 def make_maps(
-    grid: Grid, zones: Sequence[Zone], rule: TrafficRule, crossings: Crossings | None
+    grid: Grid, traffic: Sequence[TrafficZone], crossings: Crossings | None, zones: Sequence[Zone]
 ) -> Maps:
     """Edit a copy of a map, and draw the masks: zones from traffic, then the others in order.
 
@@ -124,38 +114,31 @@ def make_maps(
 
     Args:
         grid: the map.
+        traffic: zones from crossings.
+        crossings: None only where there are no such zones.
         zones: a later one replaces earlier ones where they overlap.
-        rule: which crossings make zones.
-        crossings: None only where the rule has no zones.
 
     Raises:
         InputError: a zone holds no cell, limits are in percent and in m/s, or the map is turned.
     """
     if grid.origin[2] != 0.0:
         raise InputError("is a turned map: costmaps of nav2 have no orientation")
-    limits = {zone.where: zone.limit for zone in zones if zone.limit is not None}
-    if rule.slow is not None:
-        limits[_TRAFFIC] = rule.limit
-    maps = Maps(
-        Grid(grid.p_occupied.copy(), grid.origin, grid.resolution), code=MaskCode.of(limits)
-    )
-    shape = grid.p_occupied.shape
-    if rule.keepout is not None or any(one.action in ("block", "keepout") for one in zones):
-        maps.keepout = np.zeros(shape, bool)
+    every = [*zones, *(one.zone for one in traffic)]
+    limits = {zone.where: zone.limit for zone in every if zone.limit is not None}
+    edited = Grid(grid.p_occupied.copy(), grid.origin, grid.resolution)
+    maps = Maps(edited, code=MaskCode.of(limits))
+    if any(zone.action in ("block", "keepout") for zone in every):
+        maps.keepout = np.zeros(grid.p_occupied.shape, bool)
     if limits:
-        maps.speed = np.zeros(shape, np.uint8)
-    traffic: list[tuple[int | None, Action, SpeedLimit | None, str]] = [
-        (rule.keepout, "keepout", None, "keep-out"),
-        (rule.slow, "speed", rule.limit, "slow"),
-    ]
-    for least, action, limit, kind in traffic:
-        if least is not None and crossings is not None:
-            cells = _cells_of_squares(crossings.number >= least, crossings, grid)
-            if not cells.any():
-                most = int(crossings.number.max(initial=0))
-                what = f"no square of the floor was crossed {least} times, at most {most}"
-                maps.warnings.append(f"{what}: traffic makes no {kind} zones")
-            _edit(maps, Zone(_TRAFFIC, action, limit, []), cells)
+        maps.speed = np.zeros(grid.p_occupied.shape, np.uint8)
+    for least, zone in traffic if crossings is not None else ():
+        cells = _cells_of_squares(crossings.number >= least, crossings, grid)
+        if not cells.any():
+            most = int(crossings.number.max(initial=0))
+            what = f"no square of the floor was crossed {least} times, at most {most}"
+            kind = "keep-out" if zone.action == "keepout" else "slow"
+            maps.warnings.append(f"{what}: traffic makes no {kind} zones")
+        _edit(maps, zone, cells)
     for zone in zones:
         _add_zone(maps, zone)
     return maps
