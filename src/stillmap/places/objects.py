@@ -11,8 +11,9 @@ from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content, read_bytes
 from stillmap.core.json import read_json
+from stillmap.io.point_cloud.ply import make_header
 from stillmap.results import objects
-from stillmap.results.point_cloud import coordinate_fields, ply_header
+from stillmap.results.point_cloud import coordinate_fields
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
 
@@ -108,6 +109,6 @@ def _read_cloud(path: Path) -> NDArray[np.void]:
     for is_far in (False, True):
         fields = coordinate_fields(objects.OBJECT_FIELDS, is_far)
         count, rest = divmod(len(content) - end, np.dtype(fields).itemsize)
-        if not rest and content[:end] == ply_header(fields, count):
+        if not rest and content[:end] == make_header(fields, count):
             return np.frombuffer(content, fields, offset=end)
     raise InputError("is no cloud of an object as stillmap writes it", where=str(path))

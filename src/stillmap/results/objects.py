@@ -11,10 +11,12 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.arrays import write_npz
 from stillmap.core.local_frame import FAR
+from stillmap.io.point_cloud.ply import make_header
+from stillmap.io.point_cloud.table import Fields
 from stillmap.io.trajectory import embed_in_3d
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.tilting import TiltingResult
-from stillmap.results.point_cloud import Fields, coordinate_fields, ply_header
+from stillmap.results.point_cloud import coordinate_fields
 from stillmap.results.reader import Track
 from stillmap.tracking import FlowMap, MovingObject
 
@@ -74,7 +76,7 @@ def write_ply(path: Path, ends: Float, seconds: Float, p_dynamic: Float32) -> No
     for name, column in zip("xyz", ends.T, strict=False):
         vertices[name] = column
     vertices["seconds"], vertices["p_dynamic"] = seconds, p_dynamic
-    path.write_bytes(ply_header(fields, len(ends)) + vertices.tobytes())
+    path.write_bytes(make_header(fields, len(ends)) + vertices.tobytes())
 
 
 def write_traffic(path: Path, traffic: FlowMap) -> None:

@@ -17,17 +17,14 @@ from stillmap.core.local_frame import FAR
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.table import TableLayout, read_columns
+from stillmap.io.point_cloud.table import Fields, TableLayout, read_columns
 from stillmap.io.trajectory import MAX_TRANSLATION
 
 Part = Literal["static", "dynamic"]
 
-Fields = list[tuple[str, str]]  # names and types
-
 FIELDS: Fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 COLOURS: Fields = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 PACKED_COLOUR: Fields = [("rgb", "<u4")]  # 0x00RRGGBB, of PCD
-_TYPES = {"<f4": "float", "<f8": "double", "u1": "uchar"}
 MAX_BLOCK = 1 << 16  # points in memory
 
 
@@ -233,8 +230,8 @@ def write_clouds(
         (folder / "static.ply").open("wb") as static,
         (folder / "dynamic.ply").open("wb") as moving,
     ):
-        static.write(ply_header(fields, cloud.count - dynamic))
-        moving.write(ply_header(fields, dynamic))
+        static.write(ply.make_header(fields, cloud.count - dynamic))
+        moving.write(ply.make_header(fields, dynamic))
         for block in cloud.iter_blocks():
             vertices = make_vertices(block, fields)
             moves = vertices["p_static"] < DYNAMIC_BELOW
@@ -251,7 +248,7 @@ def append_vertices(path: Path, block: Block) -> None:
     layout, whole = ply.read_layout(path), path.with_suffix(".whole")
     fields = [(name, layout.dtype[name].str.lstrip("|")) for name in layout.dtype.names or ()]
     with path.open("rb") as before, whole.open("wb") as file:
-        file.write(ply_header(fields, layout.rows + len(block.points)))
+        file.write(ply.make_header(fields, layout.rows + len(block.points)))
         before.seek(layout.start)
         shutil.copyfileobj(before, file)
         file.write(make_vertices(block, fields).tobytes())
@@ -269,13 +266,6 @@ def coordinate_fields(fields: Fields, is_far: bool) -> Fields:
     if not is_far:
         return fields
     return [(name, "<f8" if name in ("x", "y", "z") else kind) for name, kind in fields]
-
-
-def ply_header(fields: Fields, count: int) -> bytes:
-    """Of a little-endian PLY whose vertices have these fields, float32, float64 or uint8."""
-    properties = "".join(f"property {_TYPES[kind]} {name}\n" for name, kind in fields)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
-    return (head + "end_header\n").encode("ascii")
 
 
 def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:
