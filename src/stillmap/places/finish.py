@@ -23,7 +23,7 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
-from stillmap.places import grow, objects, place_map, store
+from stillmap.places import objects, place_map, store
 from stillmap.places.changes import PlaceChange, detect_place_changes
 from stillmap.places.keyframes import join_keyframes
 from stillmap.places.place import Place, PlacedSession, fit_alignment, join_constraints
@@ -76,17 +76,16 @@ def finish_place(
     Raises:
         InputError: the state is none that the place can show.
     """
-    limit = _find_limit(place, map_state)
-    planar_states = grow.estimate_planar(place)
-    planar_states, planar_changes = detect_place_changes(planar_states)
-    planar = place_map.show_state(planar_states, planar_changes, limit)
-    if place.dimension == 2:
-        return PlaceResult(place, refusals, order, planar_changes, planar, planar)
-    states = estimate_place([placed.require_evidence()[0] for placed in place.in_time()])
-    states, changes = detect_place_changes(states)
-    return PlaceResult(
-        place, refusals, order, changes, place_map.show_state(states, changes, limit), planar
-    )
+    limit, in_time = _find_limit(place, map_state), place.in_time()
+
+    def show(k: int) -> tuple[list[PlaceChange], place_map.ShownState]:
+        states = estimate_place([placed.require_evidence()[k] for placed in in_time])
+        states, changes = detect_place_changes(states)
+        return changes, place_map.show_state(states, changes, limit)
+
+    changes, planar = show(1)
+    changes, shown = show(0) if place.dimension == 3 else (changes, planar)
+    return PlaceResult(place, refusals, order, changes, shown, planar)
 
 
 def require_map_state(map_state: str, names: Sequence[str]) -> None:

@@ -5,21 +5,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float
-from stillmap.core.errors import InputError
-from stillmap.core.input_files import copy_content, read_bytes
+from stillmap.core.input_files import copy_content
 from stillmap.core.json import read_json
-from stillmap.io.point_cloud.ply import make_header
+from stillmap.io.point_cloud.ply import read_layout
+from stillmap.io.point_cloud.table import read_columns
 from stillmap.results import objects
-from stillmap.results.point_cloud import coordinate_fields
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
 
 _OBJECTS, _LIST = "objects", "objects.json"
 _MAX_BYTES = 256 << 20
-_MAX_CLOUD = 1 << 30  # bytes
 
 
 def copy_objects(result: Path, state: Path) -> None:
@@ -74,12 +71,12 @@ def _place_objects(home: Path, T: Float) -> list[dict[str, Any]]:
     kept = read_json(source / _LIST, _MAX_BYTES) if read_tracks(source / _LIST) else []
     records = [_transform_record(record, T) for record in kept]
     objects.write_records(target / _LIST, records)
-    D = T.shape[-1] - 1
+    D, names = T.shape[-1] - 1, [name for name, _ in objects.OBJECT_FIELDS]
     for path in sorted(source.glob("*.ply")):
-        vertices = _read_cloud(path)
-        points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
-        moved = T[:D, :D] @ points + T[:D, D:]
-        objects.write_ply(target / path.name, moved.T, vertices["seconds"], vertices["p_dynamic"])
+        blocks = read_columns(read_layout(path), names)
+        rows = np.hstack([np.zeros((len(names), 0)), *blocks])
+        moved = T[:D, :D] @ rows[:D] + T[:D, D:]
+        objects.write_ply(target / path.name, moved.T, *rows[3:])
     return records
 
 
@@ -96,19 +93,3 @@ def _transform_record(record: dict[str, Any], T: Float) -> dict[str, Any]:
     columns = [*zip(names, moved, strict=True), ("vx", turned[0]), ("vy", turned[1])]
     changed = {name: np.round(values, objects.MILLIMETRES).tolist() for name, values in columns}
     return {**record, "track": {**track, **changed}}
-
-
-def _read_cloud(path: Path) -> NDArray[np.void]:
-    """The points of an object.
-
-    Raises:
-        InputError: they are not as they were written.
-    """
-    content = read_bytes(path, _MAX_CLOUD)
-    end = content.find(b"end_header\n") + len(b"end_header\n")
-    for is_far in (False, True):
-        fields = coordinate_fields(objects.OBJECT_FIELDS, is_far)
-        count, rest = divmod(len(content) - end, np.dtype(fields).itemsize)
-        if not rest and content[:end] == make_header(fields, count):
-            return np.frombuffer(content, fields, offset=end)
-    raise InputError("is no cloud of an object as stillmap writes it", where=str(path))
