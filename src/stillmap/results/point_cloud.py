@@ -130,16 +130,12 @@ def cloud_from_recording(
             selected = None if colors is None else np.asarray(colors[chunk.beams][hits])
             yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns, selected)
 
-    return Cloud(
-        count=sum(
-            int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
-            for block in arrays.iter_blocks(deskewed.hit, p_static)
-        ),
-        origin=origin,
-        start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
-        make_blocks=make_blocks,
-        has_colors=colors is not None,
+    count = sum(
+        int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
+        for block in arrays.iter_blocks(deskewed.hit, p_static)
     )
+    start_ns = int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest))
+    return Cloud(count, origin, start_ns, make_blocks, colors is not None)
 
 
 def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:

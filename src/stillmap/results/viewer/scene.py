@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.core.array_types import Float, Float32, Int64
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
@@ -80,9 +80,8 @@ class Model(NamedTuple):
         return np.asarray(interpolate_pose(self.track, stamp_ns) @ self.T_track_gltf)
 
 
-@dataclass(frozen=True, eq=False)
 class Scene:
-    """A result of T scans, or a place.
+    """A result of T scans, or a place, read from its folder.
 
     Attributes:
         name: name of the recording.
@@ -96,70 +95,48 @@ class Scene:
         models: of the tracks that have one.
         origin: (3,) whole m in the map frame; everything is drawn relative to it.
         ground: height of the map image in m.
+        is_2d: whether there are neither clouds nor a surface.
         notes: what cannot be shown, and why.
         timeline: of a place; None: a single result.
         pictures: of the map of a place; None for an empty one.
     """
 
-    name: str
-    folder: str
-    stamp_ns: Int64
-    poses: Float
-    map_image: MapImage | None
-    clouds: dict[str, Points]
-    tracks: list[Track]
-    surface: bytes | None
-    models: list[Model]
-    origin: Float
-    ground: float
-    is_2d: bool
-    notes: list[str] = field(default_factory=list)
+    surface: bytes | None = None
     timeline: Timeline | None = None
     pictures: PlacePictures | None = None
 
+    def __init__(self, folder: Path, recording: str = "") -> None:
+        """Read a result or a place; optional files may be missing, unusable models are noted.
 
-def read_scene(folder: Path, recording: str = "") -> Scene:
-    """Read a result folder or a place; optional files may be missing, unusable models are noted.
+        Args:
+            folder: the result, or the place.
+            recording: name of its recording; that of the folder where it is empty.
 
-    Args:
-        folder: the result, or the place.
-        recording: name of its recording; that of the folder where it is empty.
-
-    Raises:
-        InputError: map or trajectory are missing, or a file is damaged.
-    """
-    grid, timeline, pictures = read_grid(folder), None, None
-    stamp_ns, poses = read_tum(folder / "trajectory.tum")
-    if is_place(folder):
-        timeline = read_timeline(folder)
-        if any(one.scans.stop > len(poses) for one in timeline.sessions):
-            what = "is damaged: its scans are not those of the place"
-            raise InputError(what, where=str(folder / SESSIONS))
-        pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
-    # near the scene: far away float32 would lose millimeters
-    positions, notes = poses[:, :3, 3], list[str]()
-    origin: Float = np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0)))
-    clouds = _read_clouds(folder, origin, notes)
-    tracks, surface = read_tracks(folder / "objects" / "objects.json"), None
-    if (folder / "mesh.glb").exists():
-        surface = _read_or_note(notes, gltf.read_glb, folder / "mesh.glb", _MAX_MESH)
-    return Scene(
-        name=recording or folder.resolve().name,
-        folder=folder.resolve().name,
-        stamp_ns=stamp_ns,
-        poses=poses,
-        map_image=_map_image(grid, pictures, transparent=bool(clouds)),
-        clouds={name: one for name, one in clouds.items() if len(one.points)},
-        tracks=tracks,
-        surface=surface,
-        models=_read_models(folder / "objects", tracks, notes),
-        origin=origin,
-        ground=_ground(clouds.get("Static points"), poses, origin),
-        is_2d=not clouds and surface is None,
-        notes=notes,
-        timeline=timeline,
-        pictures=pictures,
-    )
+        Raises:
+            InputError: map or trajectory are missing, or a file is damaged.
+        """
+        grid, self.notes, self.folder = read_grid(folder), list[str](), folder.resolve().name
+        self.name = recording or self.folder
+        self.stamp_ns, self.poses = read_tum(folder / "trajectory.tum")
+        if is_place(folder):
+            self.timeline = read_timeline(folder)
+            if any(one.scans.stop > len(self.poses) for one in self.timeline.sessions):
+                what = "is damaged: its scans are not those of the place"
+                raise InputError(what, where=str(folder / SESSIONS))
+            self.pictures = PlacePictures(grid, self.timeline) if grid.p_occupied.size else None
+        # near the scene: far away float32 would lose millimeters
+        positions = self.poses[:, :3, 3]
+        self.origin: Float = np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0)))
+        clouds = _read_clouds(folder, self.origin, self.notes)
+        self.clouds = {name: one for name, one in clouds.items() if len(one.points)}
+        self.tracks = read_tracks(folder / "objects" / "objects.json")
+        if (folder / "mesh.glb").exists():
+            path = folder / "mesh.glb"
+            self.surface = _read_or_note(self.notes, gltf.read_glb, path, _MAX_MESH)
+        self.map_image = _map_image(grid, self.pictures, transparent=bool(clouds))
+        self.models = _read_models(folder / "objects", self.tracks, self.notes)
+        self.ground = _ground(clouds.get("Static points"), self.poses, self.origin)
+        self.is_2d = not clouds and self.surface is None
 
 
 def _read_clouds(folder: Path, origin: Float, notes: list[str]) -> dict[str, Points]:
