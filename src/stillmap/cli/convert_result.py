@@ -66,7 +66,7 @@ def _convert_to_nav2(
     traffic = _traffic_zones(args)
     drawn = zones.read_zones(Path(args.mask)) if args.mask is not None else []
     crossings = reader.read_crossings(result.folder) if traffic else None
-    maps = nav2.make_maps(reader.read_grid(result.folder), traffic, crossings, drawn)
+    maps = nav2.Maps(reader.read_grid(result.folder), traffic, crossings, drawn)
     nav2.write(maps, output, result.output_options.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
