@@ -61,24 +61,11 @@ class Job(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A place, its recordings, and how merging their results ended; None: too few to merge."""
+    """A place, its recordings, and how merging their results ended."""
 
     name: str
     jobs: list[Job]
-    outcome: Outcome | None
-
-    @property
-    def is_done(self) -> bool:
-        """True if its result exists."""
-        return self.outcome is not None and self.outcome.is_done
-
-    @property
-    def why(self) -> str:
-        """Why there is no result."""
-        if self.outcome is not None:
-            return self.outcome.why
-        n = sum(job.outcome.is_done for job in self.jobs)
-        return f"merging takes two maps, this place has {n or 'none'}"
+    outcome: Outcome
 
 
 class Fleet(NamedTuple):
@@ -90,10 +77,8 @@ class Fleet(NamedTuple):
     @property
     def failed(self) -> int:
         """How many recordings and places failed."""
-        merged = [place.outcome for place in self.places if place.outcome is not None]
-        return sum(
-            not outcome.is_done for outcome in [*(job.outcome for job in self.jobs), *merged]
-        )
+        outcomes = [one.outcome for one in (*self.jobs, *self.places)]
+        return sum(outcome.status == "failed" for outcome in outcomes)
 
     def to_list(self) -> list[dict[str, Any]]:
         """The content of `fleet.json`: an entry for each recording."""
@@ -103,11 +88,9 @@ class Fleet(NamedTuple):
 
 def _describe(job: Job, place: Place | None) -> dict[str, Any]:
     source, outcome = job.source, job.outcome
-    merged = place is not None and place.is_done
+    merged = place is not None and place.outcome.is_done
     return {
-        "input": source.input,
-        "name": source.name,
-        "place": source.place,
+        **source._asdict(),
         "status": outcome.status,
         "why": outcome.why,
         "result": f"{RESULTS}/{source.name}" if outcome.is_done else None,
@@ -115,7 +98,7 @@ def _describe(job: Job, place: Place | None) -> dict[str, Any]:
         "peak_memory_bytes": outcome.peak_memory_bytes,
         **{name: outcome.summary.get(name) for name in _FACTS},
         "place_result": f"{PLACES}/{source.place}" if merged else None,
-        "place_why": "" if place is None or merged else place.why,
+        "place_why": "" if place is None or merged else place.outcome.why,
     }
 
 
@@ -316,17 +299,19 @@ def _merge_places(client: Any, jobs: Sequence[Job], root: str, request: Request)
     for job in jobs:
         if job.source.place is not None:
             members.setdefault(job.source.place, []).append(job)
-    tasks = []
+    tasks, outcomes = [], dict[str, Outcome]()
     for name, of_place in members.items():
         done = [job for job in of_place if job.outcome.is_done]
         if len(done) < 2:
+            why = f"merging takes two maps, this place has {len(done) or 'none'}"
+            outcomes[name] = Outcome("too few", why)
             continue
         sources = tuple(job.source.input for job in done)
         results = tuple(job.source.name for job in done)
         keys = tuple(job.outcome.key for job in done)
         tasks.append(Task("merge", name, sources, root, request.merge_flags, results, keys))
-    outcomes = _run_tasks(client, tasks, request)
-    return [Place(name, of_place, outcomes.get(name)) for name, of_place in members.items()]
+    outcomes |= _run_tasks(client, tasks, request)
+    return [Place(name, of_place, outcomes[name]) for name, of_place in members.items()]
 
 
 def _write(root: str, name: str, text: str) -> None:

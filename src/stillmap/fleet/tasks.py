@@ -44,7 +44,8 @@ class Outcome:
     """The outcome of a task.
 
     Attributes:
-        status: `done`, `failed`, or `full`: a disk is, and no task can go on.
+        status: `done`, `failed`, `full`: a disk is, and no task can go on; or `too few` results
+            to be merged.
         why: one line; empty where it is done.
         key: of what the result was made from.
         input: its recording, or the first of them.
@@ -53,7 +54,7 @@ class Outcome:
         summary: of the result, JSON-able.
     """
 
-    status: Literal["done", "failed", "full"]
+    status: Literal["done", "failed", "full", "too few"]
     why: str = ""
     key: str = ""
     input: str = ""

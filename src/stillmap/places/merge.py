@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from stillmap.places.keyframes import Session
 from stillmap.places.place import Place, update_evidence
 from stillmap.places.store import copy_session, read_place
 from stillmap.results.reader import RECORD, is_place
-from stillmap.results.result import Result, load, remove_with, report_to, to_options
+from stillmap.results.result import Result, load, report_to, to_options
 from stillmap.results.timeline import PlaceSession, read_sessions
 
 Paths: TypeAlias = Sequence[str | os.PathLike[str]]
@@ -301,5 +302,5 @@ def _merge_temporarily(job: MergeJob, report: Progress) -> Result:
     except BaseException:
         remove(home)
         raise
-    remove_with(place, home)
+    weakref.finalize(place, remove, home)  # when it is no longer used
     return place
