@@ -258,27 +258,18 @@ def plan_merge(
     Raises:
         InputError: no session is named, or one cannot be read.
     """
-    base, others = _split_base(sessions)
+    others = [[one] if isinstance(one, str | os.PathLike) else one for one in sessions]
+    first, base = others[0] if others else None, None
+    if isinstance(first, Result) and first.path is not None and len(first.sessions) > 1:
+        base = first.path
+    elif isinstance(first, list) and len(first) == 1 and is_place(Path(first[0])):
+        base = Path(first[0])
+    others = others if base is None else others[1:]
     if not others:
         where = "" if base is None else str(base)
         raise InputError("no session is named that is to be merged", where=where)
     taken = [] if base is None else [known.name for known in read_sessions(base)]
     return MergeJob(base, list_sessions(others, taken), options, frame, map_state, odometry)
-
-
-def _split_base(
-    sessions: Sequence[SessionLike],
-) -> tuple[Path | None, list[Paths | Recording | Result]]:
-    """The place that grows, if there is one, and the sessions."""
-    given = [
-        [session] if isinstance(session, str | os.PathLike) else session for session in sessions
-    ]
-    first = given[0] if given else None
-    if isinstance(first, Result) and first.path is not None and len(first.sessions) > 1:
-        return first.path, given[1:]
-    if isinstance(first, list) and len(first) == 1 and is_place(Path(first[0])):
-        return Path(first[0]), given[1:]
-    return None, given
 
 
 def _require_apart(output: Path, job: MergeJob) -> None:

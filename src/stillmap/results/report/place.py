@@ -70,15 +70,22 @@ def render_place_report(
     """
     timeline = read_timeline(folder)
     numbers = range(len(timeline.sessions))
-    pictures = small = None
+    pictures = small = maps = None
     if occupancy.p_occupied.size:
         pictures = PlacePictures(occupancy, timeline)
         small = PlacePictures(occupancy, timeline, _THUMBNAIL_PIXELS)
+        view, sessions = pictures.view, enumerate(timeline.sessions)
+        maps = {
+            **written_map_data(occupancy, mode, view),
+            "base": data_uri(pictures.draw_map()),
+            "font_size": max(view.size) * _FONT_SHARE,
+            "paths": [_path_data(folder, one, k, view) for k, one in sessions],
+        }
     data = {
         "title": f"{len(timeline.sessions)} sessions of a place",
         "place": record,
         "timeline": timeline,
-        "maps": pictures and _map_data(folder, timeline, occupancy, mode, pictures),
+        "maps": maps,
         "thumbnails": [small and (small.view, data_uri(small.draw(k))) for k in numbers],
         "steps": [_step_data(timeline, k, pictures) for k in numbers[1:]],
         "max_rows": _MAX_ROWS,
@@ -106,19 +113,6 @@ def _session_color(number: int) -> tuple[int, ...]:
 def _heading(T: Float) -> float:
     """In degrees; + 0.0 turns a negative zero into zero."""
     return round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0
-
-
-def _map_data(
-    folder: Path, timeline: Timeline, occupancy: GridMap, mode: MapMode, pictures: "PlacePictures"
-) -> dict[str, Any]:
-    """The map as written with the trajectories."""
-    view = pictures.view
-    return {
-        **written_map_data(occupancy, mode, view),
-        "base": data_uri(pictures.draw_map()),
-        "font_size": max(view.size) * _FONT_SHARE,
-        "paths": [_path_data(folder, one, k, view) for k, one in enumerate(timeline.sessions)],
-    }
 
 
 def _path_data(folder: Path, one: PlaceSession, number: int, view: MapView) -> dict[str, Any]:
