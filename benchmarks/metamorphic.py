@@ -39,8 +39,9 @@ from tables import Row, grouped, markdown
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.io.carmen.log import ScanLine, parse_scan
+from stillmap.io.trajectory import nearest_index
 from stillmap.results.eval.readers import read_planar_trajectory, read_relations
-from stillmap.results.eval.trajectory import MAX_DT, compute_relation_errors, nearest_index
+from stillmap.results.eval.trajectory import MAX_DT, compute_relation_errors
 
 Rng = np.random.Generator
 
@@ -287,7 +288,7 @@ def _trajectory(result: Path, logs: Sequence[Log]) -> Float:
     rows = read_planar_trajectory(result / "trajectory.tum")
     stamps = np.concatenate([np.c_[log.stamp, log.was][log.scan] for log in logs])
     stamp, was = stamps[np.argsort(stamps[:, 0])].T
-    rows[:, 0] = was[nearest_index(stamp, rows[:, 0])[0]]
+    rows[:, 0] = was[nearest_index(stamp, rows[:, 0])]
     return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
@@ -295,15 +296,15 @@ def _known_relations(path: Path, log: Log) -> Float:
     """(R, 8) between scans of an unchanged log, whose stamps replace those that were rounded."""
     file, scans = relations_beside(path), np.sort(log.stamp[log.scan])
     relations = read_relations(file) if file.exists() else np.empty((0, 8))
-    index, off = nearest_index(scans, relations[:, :2].ravel())
-    relations[:, :2] = scans[index].reshape(-1, 2)
-    return relations[(off <= MAX_DT).reshape(-1, 2).all(axis=1)]
+    wanted = relations[:, :2].copy()
+    relations[:, :2] = scans[nearest_index(scans, wanted.ravel())].reshape(-1, 2)
+    return relations[(np.abs(relations[:, :2] - wanted) <= MAX_DT).all(axis=1)]
 
 
 def _largest_step(poses: Float, log: Log) -> float:
     """m/s from one pose to the next, off the odometry of the unchanged log."""
     scans = log.part(log.scan).in_order()
-    known = scans.pose[nearest_index(scans.stamp, poses[:, 0])[0]]
+    known = scans.pose[nearest_index(scans.stamp, poses[:, 0])]
     T, T_odom = se2.matrix(*poses[:, 1:].T), se2.matrix(*known.T)
     off = se2.inverse(T[:-1]) @ T[1:] - se2.inverse(T_odom[:-1]) @ T_odom[1:]
     steps = np.linalg.norm(off[:, :2, 2], axis=1) / np.maximum(np.diff(poses[:, 0]), 1.0)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.json import to_jsonable
-from stillmap.pipeline.tilting_beams import lift_poses
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.results.eval import trajectory
 from stillmap.results.eval.trajectory import read_paired_poses
 from stillmap.results.reader import require_there
@@ -77,7 +77,7 @@ def _align(result: Path, seen: CameraSimulation) -> Float:
     T = trajectory.align(
         *trajectory.project_flat_trajectories(*read_paired_poses(result, seen.truth))
     )
-    return T if len(T) == 4 else lift_poses(T[None])[0]
+    return embed_in_3d(T)
 
 
 def _score_movers(result: Path, seen: CameraSimulation, T_world_map: Float) -> MoverScores:

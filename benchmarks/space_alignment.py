@@ -164,11 +164,11 @@ def align_ours(kind: str, one: Mapped, other: Mapped, with_merge: bool) -> list[
     rows = [Row(kind, OURS, not found.refused, *errors(kind, T, one, other), cpu)]
     if with_merge:
         begun = time.process_time()
-        growth = add_session(place, other.session, 1)
+        grown, why = add_session(place, other.session, 1)
         cpu = time.process_time() - begun
-        if not growth.refused:
-            T = fit_alignment(other.session.poses, growth.place.sessions[1].poses)
-        rows.append(Row(kind, MERGED, not growth.refused, *errors(kind, T, one, other), cpu))
+        if not why:
+            T = fit_alignment(other.session.poses, grown.sessions[1].poses)
+        rows.append(Row(kind, MERGED, not why, *errors(kind, T, one, other), cpu))
     return rows
 
 

@@ -3,6 +3,8 @@ imported."""
 
 import gc
 import resource
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +24,34 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip("no folder of real recordings beside the checkout (../shared/data)")
     return path
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Calls stillmap within this process."""
+    from stillmap.cli.main import main
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        arguments = [str(word) for word in words]
+        return subprocess.CompletedProcess(arguments, main(arguments), *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def start() -> Callable[..., subprocess.Popen[str]]:
+    """Starts stillmap, which hears Ctrl-C even where the tests themselves do not."""
+
+    def popen(*words: object, **options: object) -> subprocess.Popen[str]:
+        before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
+        try:
+            defaults = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+            command = [sys.executable, "-m", "stillmap", *map(str, words)]
+            return subprocess.Popen(command, **(defaults | options))
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    return popen
 
 
 @pytest.fixture

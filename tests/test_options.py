@@ -226,7 +226,7 @@ def test_toml_files_that_cannot_be_used(tmp_path: Path) -> None:
     deep.write_text("a = " + "[" * 50_000)
     for path, said in (
         (broken, f"{broken}:2: is not TOML"),
-        (binary, "is not TOML"),
+        (binary, "is not a text file"),
         (deep, "is not TOML"),
         (tmp_path, "cannot be read"),
         (tmp_path / "absent", "cannot be read"),

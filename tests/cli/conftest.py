@@ -38,32 +38,6 @@ def stillmap(command: list[str]) -> Run:
     return run
 
 
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Run:
-    """The same without a process of its own: quicker."""
-
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
-        arguments = [str(word) for word in words]
-        return subprocess.CompletedProcess(arguments, main(arguments), *capsys.readouterr())
-
-    return run
-
-
-@pytest.fixture(scope="session")
-def start(command: list[str]) -> Callable[..., subprocess.Popen[str]]:
-    """Starts stillmap, which hears Ctrl-C even where the tests themselves do not."""
-
-    def popen(*words: object, **options: object) -> subprocess.Popen[str]:
-        before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
-        try:
-            defaults = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-            return subprocess.Popen([*command, *map(str, words)], **(defaults | options))
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-    return popen
-
-
 @pytest.fixture(scope="session")
 def on_a_terminal(start: Callable[..., subprocess.Popen[str]]) -> Callable[..., tuple[int, str]]:
     """Runs stillmap with stderr on a terminal; Ctrl-C as soon as `send_at` shows.

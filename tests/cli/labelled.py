@@ -8,6 +8,7 @@ import numpy as np
 from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.trajectory import write_tum
+from stillmap.results.writer import write_labels
 
 N = 40  # points of a scan
 RNG = np.random.default_rng(2)
@@ -28,14 +29,9 @@ def label(
     blank = recording.hit & (rng.random(recording.n_beams) < share)
     p_static = np.where(blank, 0.1, 0.9).astype(np.float32)
     usable = ~np.isnan(recording.points).any(axis=1)
-    (folder / "beams").mkdir(parents=True)
-    for name, array in (
-        ("stamp_ns", recording.stamp_ns),
-        ("offset", recording.offset),
-        ("hit", recording.hit),
-        ("p_static", np.where(usable, p_static, np.float32(np.nan))),
-    ):
-        np.save(folder / "beams" / f"{name}.npy", array)
+    folder.mkdir(parents=True)
+    p_static[~usable] = np.nan
+    write_labels(folder / "beams", recording, p_static)
     poses = np.tile(np.eye(recording.dimension + 1), (recording.n_scans, 1, 1))
     poses[:, 0, -1] = np.arange(recording.n_scans)  # a metre ahead at each scan
     write_tum(folder / "trajectory.tum", recording.stamp_ns, poses)
@@ -73,14 +69,6 @@ def check_same_but(before, after, blank):
     if before.beam_time is not None:
         np.testing.assert_array_equal(again.beam_time[again.hit], before.beam_time[kept])
     return again
-
-
-def files(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def kitti(folder, layout="velodyne", times="times.txt"):

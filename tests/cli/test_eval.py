@@ -12,6 +12,7 @@ from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import write_tum
 from stillmap.results.map_server import write_map_npz
 from stillmap.results.reader import Grid
+from stillmap.results.writer import write_labels
 from stillmap.sim import Scene, scene_by_name, simulate, write_simulation
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
@@ -42,7 +43,7 @@ def simulated(tmp_path_factory) -> Path:
 def result(simulated, tmp_path) -> Path:
     """A result as good as the truth allows, in the frame of the first pose."""
     out = tmp_path / "result"
-    (out / "beams").mkdir(parents=True)
+    out.mkdir()
     recording = stillmap_folder.read(simulated)
     truth = simulated / "truth"
     T_world_base, static = np.load(truth / "T_world_base.npy"), np.load(truth / "static.npy")
@@ -50,10 +51,7 @@ def result(simulated, tmp_path) -> Path:
     write_tum(out / "trajectory.tum", recording.stamp_ns, T_map_base)
     p_static = np.where(recording.hit, np.where(static, 0.98, 0.03), 0.8).astype(np.float32)
     p_static[~np.isfinite(recording.points).all(1)] = np.nan
-    np.save(out / "beams/p_static.npy", p_static)
-    np.save(out / "beams/hit.npy", recording.hit)
-    np.save(out / "beams/stamp_ns.npy", recording.stamp_ns)
-    np.save(out / "beams/offset.npy", recording.offset)
+    write_labels(out / "beams", recording, p_static)
     write_map(out, recording, T_map_base, static & recording.hit)
     return out
 
@@ -175,37 +173,35 @@ def test_map(capsys, simulated, result):
     assert "walls_kept              1" in capsys.readouterr().out
 
 
-def test_map_with_people_against_reference_map(capsys, simulated, result, tmp_path):
-    recording = stillmap_folder.read(simulated)
+@pytest.fixture
+def raw(simulated, tmp_path) -> Path:
+    """A result with people in its map, whose frame is the world's."""
+    out, recording = tmp_path / "raw", stillmap_folder.read(simulated)
     T_world_base = np.load(simulated / "truth/T_world_base.npy")
-    other = tmp_path / "raw"
-    other.mkdir()
-    # this one's map frame is the world's
-    write_tum(other / "trajectory.tum", recording.stamp_ns, T_world_base)
-    write_map(other, recording, T_world_base, recording.hit)
-    s = scores(capsys, "map", other, simulated)
-    assert s["ghosts_per_100_m2"] > 10
-    assert s["walls_kept"] == 1.0
-    s = scores(capsys, "map", result, simulated, "--reference", other)
-    assert s["walls_kept"] > 0.97
-    again = ("--reference", other, "--reference-truth", simulated)
-    assert scores(capsys, "map", result, simulated, *again) == s
-
-
-def test_things_brought_in_are_not_ghosts(capsys, simulated, tmp_path):
-    recording, there = stillmap_folder.read(simulated), tmp_path / "there"
-    shutil.copytree(simulated, there)
-    T_world_base = np.load(there / "truth/T_world_base.npy")
-    out = tmp_path / "raw"
     out.mkdir()
     write_tum(out / "trajectory.tum", recording.stamp_ns, T_world_base)
     write_map(out, recording, T_world_base, recording.hit)
+    return out
+
+
+def test_map_with_people_against_reference_map(capsys, simulated, result, raw):
+    s = scores(capsys, "map", raw, simulated)
+    assert s["ghosts_per_100_m2"] > 10
+    assert s["walls_kept"] == 1.0
+    s = scores(capsys, "map", result, simulated, "--reference", raw)
+    assert s["walls_kept"] > 0.97
+    again = ("--reference", raw, "--reference-truth", simulated)
+    assert scores(capsys, "map", result, simulated, *again) == s
+
+
+def test_things_brought_in_are_not_ghosts(capsys, simulated, raw, tmp_path):
+    there = shutil.copytree(simulated, tmp_path / "there")
     everywhere = [(-4.0, y, 4.0, y) for y in np.arange(-3, 3, 0.05)]
     np.save(there / "truth/lasting.npy", np.array(everywhere))
-    assert scores(capsys, "map", out, simulated)["ghost_cells"] > 10
-    assert scores(capsys, "map", out, there)["ghost_cells"] == 0
+    assert scores(capsys, "map", raw, simulated)["ghost_cells"] > 10
+    assert scores(capsys, "map", raw, there)["ghost_cells"] == 0
     (there / "truth/lasting.npy").unlink()  # as where there are none
-    assert scores(capsys, "map", out, there)["ghost_cells"] > 10
+    assert scores(capsys, "map", raw, there)["ghost_cells"] > 10
 
 
 def broken(path: Path) -> None:
@@ -237,20 +233,17 @@ def test_missing_and_damaged_files_are_named(
     assert str(tmp_path / name) in said
 
 
-def test_labels_outside_0_to_1_are_refused(capsys, simulated, result):
-    path = result / "beams/p_static.npy"
-    p = np.load(path)
-    p[17] = 1.5
-    np.save(path, p)
-    assert "beam 17" in refusal(capsys, "labels", result, simulated)
-
-
-def test_labels_of_another_recording_are_refused(capsys, simulated, result):
-    path = result / "beams/stamp_ns.npy"
-    stamps = np.load(path)
-    stamps[5] += 1
-    np.save(path, stamps)
-    assert "scan 5 differs" in refusal(capsys, "labels", result, simulated)
+@pytest.mark.parametrize(
+    ("name", "at", "said"), [("p_static", 17, "beam 17"), ("stamp_ns", 5, "scan 5 differs")]
+)
+def test_labels_that_cannot_be_or_are_of_another_recording(
+    capsys, simulated, result, name, at, said
+):
+    path = result / f"beams/{name}.npy"
+    array = np.load(path)
+    array[at] += 1
+    np.save(path, array)
+    assert said in refusal(capsys, "labels", result, simulated)
 
 
 def test_missing_folders_are_named(capsys, result, simulated, tmp_path):
@@ -285,11 +278,9 @@ def rig(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("part", ["horizontal", "tilting"])
 def test_rig_labels_select_the_truth(capsys, rig, tmp_path, part):
     out, recording = tmp_path / "out", stillmap_folder.read(rig / part)
-    (out / "beams").mkdir(parents=True)
+    out.mkdir()
     p_static = np.where(np.load(rig / part / "truth/static.npy"), 0.9, 0.2).astype(np.float32)
-    np.save(out / "beams/p_static.npy", p_static)
-    for name in ("hit", "stamp_ns", "offset"):
-        np.save(out / f"beams/{name}.npy", getattr(recording, name))
+    write_labels(out / "beams", recording, p_static)
     found = scores(capsys, "labels", out, rig)
     assert found == scores(capsys, "labels", out, rig / part)
     assert found["brier"] < 0.05

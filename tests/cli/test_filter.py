@@ -38,8 +38,7 @@ def test_filtered_log(call, tmp_path):
         lines.append(f"FLASER 61 {readings} 0 0 0 0 0 0 {0.2 * t:.2f} host {0.2 * t:.2f}\n")
     source, out = tmp_path / "walk.log", tmp_path / "out"
     source.write_text("".join(lines))
-    quick = ["--set", "em.max_iterations=1", "--quiet"]
-    assert call("map", source, "-o", out, *quick).returncode == 0
+    assert call("map", source, "-o", out, *QUICK).returncode == 0
     done = call("filter", out, "-o", tmp_path / "clean.log.gz", "--quiet")
     assert (done.returncode, done.stderr) == (0, "")
     before, after = read(source), read(tmp_path / "clean.log.gz")

@@ -4,7 +4,8 @@ import struct
 
 import numpy as np
 import pytest
-from labelled import N, check_same_but, cloud, files, label, run
+from flat import files_of
+from labelled import N, check_same_but, cloud, label, run
 
 from stillmap.io import read
 
@@ -54,7 +55,7 @@ def test_pcd_folder(call, tmp_path, kind):
     (tmp_path / "pcd/cloud_3.5.pcd").write_bytes(b"VERSION 0.7\n")
     recording, blank = label(tmp_path / "pcd", tmp_path / "out")
     assert run(call, tmp_path / "out", tmp_path / "clean")["scans_left_out"] == 1
-    after = files(tmp_path / "clean")
+    after = files_of(tmp_path / "clean")
     assert after.pop("more/notes.txt") == b"kept"
     for scan, name in enumerate(("cloud_1.5", "cloud_2.5", "cloud_10.25")):
         kept = ~blank[recording.beams_of(scan)]
@@ -130,7 +131,7 @@ def test_ply(call, tmp_path, form, faces):
         (tmp_path / f"ply/scan{k}.ply").write_bytes(ply_bytes(cloud(), form, faces))
     recording, blank = label(tmp_path / "ply", tmp_path / "out")
     run(call, tmp_path / "out", tmp_path / "clean")
-    before, after = files(tmp_path / "ply"), files(tmp_path / "clean")
+    before, after = files_of(tmp_path / "ply"), files_of(tmp_path / "clean")
     assert set(before) == set(after)
     for scan, name in enumerate(sorted(before)):
         gone = blank[recording.beams_of(scan)]

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from labelled import N, check_same_but, files, kitti, label, run
+from flat import files_of
+from labelled import N, check_same_but, kitti, label, run
 from refusals import refused
 
 from stillmap.io import read
@@ -19,7 +20,7 @@ def test_kitti_folder(call, tmp_path, layout, times):
     summary = run(call, source / "out", tmp_path / "clean")
     assert summary["blanked"] == blank.sum() > 20
     assert summary["scans_left_out"] == 1
-    before, after = files(source), files(tmp_path / "clean")
+    before, after = files_of(source), files_of(tmp_path / "clean")
     assert set(after) == {name for name in before if not name.startswith("out/")}
     for scan, number in enumerate((0, 1, 3)):
         name = f"{layout}/{number:06d}.bin"
@@ -39,9 +40,9 @@ def test_linked_labels_of_the_source_stay(call, tmp_path, linked):
     (source / linked).rename(tmp_path / "truth/given")
     (source / linked).symlink_to(tmp_path / "truth/given")
     recording, blank = label(source, tmp_path / "out")
-    before = files(tmp_path / "truth")
+    before = files_of(tmp_path / "truth")
     run(call, tmp_path / "out", tmp_path / "clean")
-    assert files(tmp_path / "truth") == before
+    assert files_of(tmp_path / "truth") == before
     after = (tmp_path / "clean/labels/000001.label").read_bytes()
     assert len(after) == 4 * (~blank[recording.beams_of(1)]).sum()
     assert (tmp_path / "clean/labels/000003.label").read_bytes() == b"of other points"

@@ -115,14 +115,16 @@ def test_what_is_refused(call, flat_days, flat_place, tmp_path, nothing_left):
     day1 = flat_days / "map1"
     refused(call("merge", day1, tmp_path / "no.bag", "-o", out), "no.bag: does not exist")
     refused(call("merge", day1, flat_place, "-o", out), "is a place, among sessions")
-    refused(call("merge", flat_place, "-o", out), "names no session to add")
+    refused(call("merge", flat_place, "-o", out), "no session is named")
     refused(call("merge", day1, "-o", out), "one session alone is no place")
     refused(
         call("merge", day1, flat_days / "map2", "-o", out, "--map-state", "new"),
         "is no state of a map: new",
         "--map-state last",
     )
-    refused(call("merge", day1, flat_days / "map2", "-o", day1, "--overwrite"), "recording itself")
+    refused(
+        call("merge", day1, flat_days / "map2", "-o", day1, "--overwrite"), "one of the sessions"
+    )
     nothing_left()
     copy = tmp_path / "copy"
     shutil.copytree(flat_place, copy)

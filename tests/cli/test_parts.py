@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flat import files_of
 from refusals import refused
 
 import stillmap
@@ -57,11 +58,8 @@ def day_after(room, tmp_path):
 
 def contents(folder):
     """All files but the record and the report, which name the inputs and times."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name not in ("run.json", "report.html")
-    }
+    named = ("run.json", "report.html")
+    return {name: data for name, data in files_of(folder).items() if name not in named}
 
 
 @pytest.mark.parametrize("form", ["folder", "log"])

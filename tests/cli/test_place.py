@@ -135,7 +135,7 @@ def test_a_session_is_converted_in_the_frame_of_the_place(call, flat_place, tmp_
 
 def test_a_cloud_of_a_place_in_3d(call, flat_place, tmp_path):
     """Of the points that the place itself has: no recording is read."""
-    from stillmap.results.point_cloud import ply_header
+    from stillmap.io.point_cloud.ply import make_header
 
     copy = tmp_path / "place"
     shutil.copytree(flat_place, copy)
@@ -144,7 +144,7 @@ def test_a_cloud_of_a_place_in_3d(call, flat_place, tmp_path):
     fields = [(name, "<f4") for name in ("x", "y", "z", "p_static")]
     for part, p in (("static", 0.9), ("dynamic", 0.1)):
         points = np.array([(1.0, 2.0, 3.0, p)] * 3, fields)
-        (copy / f"{part}.ply").write_bytes(ply_header(fields, 3) + points.tobytes())
+        (copy / f"{part}.ply").write_bytes(make_header(fields, 3) + points.tobytes())
     done = call("convert", copy, "-o", tmp_path / "a.xyz")
     assert done.returncode == 0, done.stderr
     assert "6 points" in done.stderr

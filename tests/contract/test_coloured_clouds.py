@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from stillmap.io.point_cloud.ply import make_header
 from stillmap.results import point_cloud
 from stillmap.results.export import point_cloud_files
-from stillmap.results.point_cloud import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.results.point_cloud import COLOURS, FIELDS, put_colours
 
 N = 70_000
 
@@ -97,14 +98,14 @@ def test_cloud_from_folder_has_colors(points, tmp_path):
     rows["p_static"] = np.where(np.arange(N) < 9, 0.1, 0.9)
     put_colours(rows, points.colors)
     for part, its in (("dynamic", rows[:9]), ("static", rows[9:])):
-        head = ply_header(FIELDS + COLOURS, len(its))
+        head = make_header(FIELDS + COLOURS, len(its))
         (tmp_path / f"{part}.ply").write_bytes(head + its.tobytes())
     found = point_cloud.cloud_from_folder(tmp_path)
     assert found.has_colors
     colours = np.concatenate([block.colors for block in found.make_blocks()])
     np.testing.assert_array_equal(colours, np.roll(points.colors, -9, axis=0))
     plain = np.zeros(2, FIELDS)
-    (tmp_path / "dynamic.ply").write_bytes(ply_header(FIELDS, 2) + plain.tobytes())
+    (tmp_path / "dynamic.ply").write_bytes(make_header(FIELDS, 2) + plain.tobytes())
     found = point_cloud.cloud_from_folder(tmp_path)
     assert not found.has_colors
     assert all(block.colors is None for block in found.make_blocks())

@@ -8,7 +8,6 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.results.eval.trajectory import (
     align,
-    align_points,
     associate_trajectories,
     compute_absolute_errors,
     compute_relative_errors,
@@ -132,7 +131,7 @@ def test_absolute_error_by_hand():
 
 def test_alignment_never_mirrors():
     corners = np.array([[0, 0], [2, 0], [0, 1]], float)
-    T = align_points(corners * (1, -1), corners)
+    T = se2.align_points(corners * (1, -1), corners)
     assert np.linalg.det(T[:2, :2]) == pytest.approx(1.0)
     np.testing.assert_allclose(T[:2, :2] @ T[:2, :2].T, np.eye(2), atol=1e-12)
 

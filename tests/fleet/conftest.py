@@ -1,6 +1,5 @@
 """Fixtures: small recordings, results made by hand, a stand-in for stillmap, S3, Dask."""
 
-import signal
 import socket
 import subprocess
 import sys
@@ -22,34 +21,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests s
 import stand_in as stand_ins
 from fleet_processes import NAMES, wait_until
 from result_contents import contents
-
-COMMAND = [sys.executable, "-m", "stillmap"]
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Calls stillmap within this process."""
-
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
-        arguments = [str(word) for word in words]
-        return subprocess.CompletedProcess(arguments, main(arguments), *capsys.readouterr())
-
-    return run
-
-
-@pytest.fixture(scope="session")
-def start() -> Callable[..., subprocess.Popen[str]]:
-    """Starts stillmap, which hears Ctrl-C even where the tests themselves do not."""
-
-    def popen(*words: object, **options: object) -> subprocess.Popen[str]:
-        before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
-        try:
-            defaults = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-            return subprocess.Popen([*COMMAND, *map(str, words)], **(defaults | options))
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-    return popen
 
 
 def _record(path: Path, seed: int, scans: int) -> None:

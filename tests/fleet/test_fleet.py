@@ -267,6 +267,6 @@ def test_names_of_files_are_no_markup():
     summary = {"warnings": [evil], "notes": [evil], "quality": {}, "area": {}, "sessions": []}
     done = Job(Source(f"/{evil}", "a", evil), Outcome("done", summary=summary))
     bad = Job(Source("/b", evil, evil), Outcome("failed", evil))
-    page = render_page(Fleet([done, bad], [Place(evil, [done, bad], None)]))
+    page = render_page(Fleet([done, bad], [Place(evil, [done, bad], Outcome("too few", evil))]))
     assert "<script" not in page
     assert page.count("&lt;script&gt;") >= 6

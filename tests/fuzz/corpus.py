@@ -23,7 +23,7 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.config import to_toml
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
-from stillmap.io.point_cloud.las import _make_header
+from stillmap.io.point_cloud.las import make_header
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.options import Options
 
@@ -163,7 +163,7 @@ def las(work: Path) -> Iterator[bytes]:
 
     # a later version, with another point format
     head = laspy.LasHeader(point_format=6, version="1.4")
-    head.scales = _make_header(laspy, np.eye(4)[None]).scales
+    head.scales = make_header(laspy, 0, "1.2", np.zeros(3)).scales
     for packed in (False, True):
         out = io.BytesIO()
         with laspy.open(out, "w", header=head, do_compress=packed, closefd=False) as writer:

@@ -27,7 +27,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.em import OccupancyMap
 from stillmap.io import stillmap_folder
-from stillmap.io.point_cloud.ply import read_layout
+from stillmap.io.point_cloud.ply import make_header, read_layout
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KeptMap, KnownMap, extend_map, write_extended_cloud
 from stillmap.live.mapper import LiveMapper
@@ -38,7 +38,6 @@ from stillmap.results.point_cloud import (
     cloud_from_folder,
     coordinate_fields,
     make_vertices,
-    ply_header,
 )
 
 EDGE = 0.15  # m, of a voxel
@@ -215,7 +214,7 @@ def test_clouds_far_from_the_origin_are_joined(tmp_path):
     fields = coordinate_fields(FIELDS, is_far=True)
     point = Block(utm + np.array([[0.01, 0.0, 0.0]]), np.ones(1, np.float32), None)
     own = make_vertices(point, fields)
-    (tmp_path / "static.ply").write_bytes(ply_header(fields, 1) + own.tobytes())
+    (tmp_path / "static.ply").write_bytes(make_header(fields, 1) + own.tobytes())
     (tmp_path / "live").mkdir()
     points = utm + np.array([[0.02, 0.01, 0.0], [0.02, 40.003, 0.0]])
     p_static, route = np.array([0.9, 0.7], np.float32), np.eye(4)[None]

@@ -14,7 +14,8 @@ from flat import OPTIONS, files_of, record_elsewhere
 import stillmap
 from stillmap.core import array_folder
 from stillmap.core.errors import InputError
-from stillmap.places import finish, store
+from stillmap.places import store
+from stillmap.results import map_server
 
 
 def damage(path: Path) -> list[bytes | None]:
@@ -228,7 +229,7 @@ def _fill_disk(path: Path, *_: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "name"), [(array_folder, "write_npy"), (finish, "write_map_npz")]
+    ("module", "name"), [(array_folder, "write_npy"), (map_server, "write_map_npz")]
 )
 def test_a_full_disk(flat_place, flat_days, tmp_path, monkeypatch, module, name) -> None:
     out = tmp_path / "out"

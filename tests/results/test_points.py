@@ -59,11 +59,12 @@ def test_dynamic_points(ragged):
 @pytest.mark.usefixtures("block")
 def test_counts(result):
     recording = result.recording
-    low_prior = np.where(recording.hit, result.p_static, np.float32(0.1))
+    is_labelled = recording.hit | np.isnan(result.p_static)
+    low_prior = np.where(is_labelled, result.p_static, np.float32(0.1))
     unusable = int(np.isnan(recording.points[:, 0]).sum())
     hits = int(recording.hit.sum())
     assert unusable == 3
-    assert count_beams(recording, low_prior) == {
+    assert count_beams(recording.hit, low_prior) == {
         "beams": recording.n_beams,
         "hits": hits,
         "max_range": recording.n_beams - hits - unusable,

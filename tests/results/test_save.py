@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+from flat import files_of
 
 from stillmap.core.errors import InputError
 from stillmap.io.trajectory import read_tum
@@ -30,17 +31,9 @@ FILES = {
 }
 
 
-def contents(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
-
-
 def test_the_folder_is_complete_and_agrees_with_itself(tmp_path, result):
     save(result, tmp_path / "out")
-    files = contents(tmp_path / "out")
+    files = files_of(tmp_path / "out")
     assert set(files) == FILES
     run = json.loads(files["run.json"])
     stamps, _ = read_tum(tmp_path / "out/trajectory.tum")
@@ -54,7 +47,7 @@ def test_files_follow_the_options(tmp_path, result):
     def written(**changes):
         options = dataclasses.replace(result.options, **changes)
         save(dataclasses.replace(result, options=options, graph=None), tmp_path / "out", True)
-        return set(contents(tmp_path / "out"))
+        return set(files_of(tmp_path / "out"))
 
     assert written() == FILES - {"graph.g2o"}
     moving = {name for name in FILES if name.startswith(("objects/", "traffic"))}
@@ -68,7 +61,7 @@ def test_same_result_same_bytes_except_for_timings(tmp_path, result):
     save(result, tmp_path / "a")
     save(result, tmp_path / "b")
     save(dataclasses.replace(result, stages=slower), tmp_path / "c")
-    a, b, c = (contents(tmp_path / name) for name in "abc")
+    a, b, c = (files_of(tmp_path / name) for name in "abc")
     assert a == b
     assert {name for name in FILES if a[name] != c[name]} == {"run.json", "report.html"}
 
@@ -86,7 +79,7 @@ def test_a_save_that_fails_leaves_nothing(tmp_path, result, monkeypatch, kind):
 
 def test_a_save_that_fails_keeps_what_was_there(tmp_path, result, monkeypatch):
     save(result, tmp_path / "out")
-    before = contents(tmp_path / "out")
+    before = files_of(tmp_path / "out")
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -94,7 +87,7 @@ def test_a_save_that_fails_keeps_what_was_there(tmp_path, result, monkeypatch):
     monkeypatch.setattr(save_module, "render_report", full)
     with pytest.raises(InputError, match="No space left"):
         save(result, tmp_path / "out", overwrite=True)
-    assert contents(tmp_path / "out") == before
+    assert files_of(tmp_path / "out") == before
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
@@ -111,4 +104,4 @@ def test_overwriting_must_be_asked_for(tmp_path, result):
         save(result, tmp_path / "out")
     assert (tmp_path / "out" / "mine.txt").read_text() == "kept"
     save(result, tmp_path / "out", overwrite=True)
-    assert set(contents(tmp_path / "out")) == FILES
+    assert set(files_of(tmp_path / "out")) == FILES

@@ -12,7 +12,7 @@ from stillmap.core import se2
 from stillmap.core.arrays import write_npz
 from stillmap.io.trajectory import poses_from_tum, write_tum
 from stillmap.results.point_cloud import write_clouds
-from stillmap.results.viewer.scene import Beams, read_scene
+from stillmap.results.viewer.scene import Beams, Scene
 from stillmap.results.writer import write_labels
 from stillmap.slam import SlamOptions
 
@@ -102,7 +102,7 @@ def opened():
 def window(result_of, beams_of, opened):
     """One of a 3D result with surface and models."""
     out = result_of(3, with_models=True)
-    return opened(read_scene(out, "walk<b>.bag"), beams_of(out))
+    return opened(Scene(out, "walk<b>.bag"), beams_of(out))
 
 
 def _written(out, recording, poses, p_static, log):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.mesh.texture import TexturedMesh
 from stillmap.results.colors import BACKGROUND, TEAL
 from stillmap.results.gltf import write_glb
-from stillmap.results.viewer.scene import read_scene
+from stillmap.results.viewer.scene import Scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 pytest.importorskip("websockets.sync.client")
@@ -77,7 +77,7 @@ def tiled(path, tones):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_page_shows_the_result_without_foreign_requests(result_of, beams_of, tab, dimension):
     out = result_of(dimension, with_models=dimension == 3)
-    window = Window(read_scene(out), beams_of(out))
+    window = Window(Scene(out), beams_of(out))
     try:
         window._boxes["Beams"].value = True
         window.step()
@@ -103,7 +103,7 @@ def test_texture_colors_are_shown_unchanged(result_of, tab):
     out = result_of(3)
     tones = [(118, 13, 41), (250, 248, 240), (230, 60, 40), (60, 200, 60)]
     tiled(out / "mesh.glb", tones)
-    window = Window(read_scene(out), None)
+    window = Window(Scene(out), None)
     for name, box in window._boxes.items():
         box.value = name == "Surface"
 
@@ -133,7 +133,7 @@ def shown(result_of, beams_of, opened, tab):
 
     def page(dimension):
         out = result_of(dimension)
-        window = opened(read_scene(out, "walk.bag"), beams_of(out))
+        window = opened(Scene(out, "walk.bag"), beams_of(out))
         counts = shown_in(tab, window, hues, ("orange", "blue"))
         assert min(counts["orange"], counts["blue"]) > 20, counts
         # what covers the page without a graphics card

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.results.viewer.scene import read_scene
+from stillmap.results.viewer.scene import Scene
 
 viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 sockets = pytest.importorskip("websockets.sync.client")
@@ -113,14 +113,14 @@ def test_no_share_url_is_requested(window, monkeypatch):
 
 
 def test_nothing_is_printed(result_of, capfd):
-    window = Window(read_scene(result_of(2)), None)
+    window = Window(Scene(result_of(2)), None)
     window.close()
     assert capfd.readouterr() == ("", "")
 
 
 def test_taken_port_is_refused(window, result_of):
     with pytest.raises(InputError, match="is taken"):
-        Window(read_scene(result_of(2)), None, port_of(window))
+        Window(Scene(result_of(2)), None, port_of(window))
 
 
 def test_unknown_viser_is_refused(result_of, monkeypatch):
@@ -133,7 +133,7 @@ def test_unknown_viser_is_refused(result_of, monkeypatch):
 
     monkeypatch.setattr(module, "_guard_servers", nothing)
     with pytest.raises(RuntimeError, match="viser"):
-        Window(read_scene(result_of(2)), None)
+        Window(Scene(result_of(2)), None)
 
 
 @pytest.mark.parametrize(

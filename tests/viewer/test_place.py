@@ -13,7 +13,7 @@ from small_place import CHAIR, NAMES, make_place
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
 from stillmap.results.colors import KIND_COLORS
-from stillmap.results.viewer.scene import read_scene
+from stillmap.results.viewer.scene import Scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
@@ -27,7 +27,7 @@ def place(tmp_path):
 
 @pytest.fixture
 def window(place, opened):
-    return opened(read_scene(place), None)
+    return opened(Scene(place), None)
 
 
 def node(window, path):
@@ -95,7 +95,7 @@ def test_objects_are_those_of_the_session(window):
 
 def test_objects_of_another_session_at_the_same_time_are_not_shown(tmp_path, opened):
     """Clocks of robots, or of simulations, may agree."""
-    window = opened(read_scene(make_place(tmp_path / "place", step=0)), None)
+    window = opened(Scene(make_place(tmp_path / "place", step=0)), None)
     objects = [track.session for track in window._scene.tracks]
     assert objects == [*NAMES[:2]]
     for session in (0, 1):
@@ -123,7 +123,7 @@ def test_keys_step_through_sessions(window):
 def test_damaged_place_is_refused(place, name):
     (place / name).write_bytes(b"{")
     with pytest.raises(InputError, match=Path(name).name):
-        read_scene(place)
+        Scene(place)
 
 
 def test_command_takes_no_recording_for_a_place(place, capsys):

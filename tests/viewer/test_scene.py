@@ -8,11 +8,11 @@ from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.results.gltf import read_glb
 from stillmap.results.viewer.nodes import default_view
-from stillmap.results.viewer.scene import read_scene
+from stillmap.results.viewer.scene import Scene
 
 
 def test_map_image_has_the_orientation_of_the_map(result_of):
-    plan = read_scene(result_of(2)).map_image
+    plan = Scene(result_of(2)).map_image
     x0, y0, x1, y1 = plan.window
     height, width = plan.picture.shape[:2]
     edge = (x1 - x0) / width
@@ -26,7 +26,7 @@ def test_map_image_has_the_orientation_of_the_map(result_of):
 
 def test_3d_result(result_of):
     out = result_of(3, with_models=True)
-    scene = read_scene(out)
+    scene = Scene(out)
     assert not scene.is_2d
     p_static, hit = (np.load(out / f"beams/{name}.npy") for name in ("p_static", "hit"))
     counts = {
@@ -42,7 +42,7 @@ def test_3d_result(result_of):
 
 
 def test_models_move_along_their_tracks(result_of):
-    scene = read_scene(result_of(3, with_models=True))
+    scene = Scene(result_of(3, with_models=True))
     (model,) = scene.models
     own = model.pose_at(int(scene.stamp_ns[1]))  # where its file places it
     assert own[:3, 1].tolist() == [0.0, 0.0, 1.0]  # its y is up
@@ -66,7 +66,7 @@ def test_unusable_model_is_noted(result_of, name, content, said):
         (out / name).unlink()
     else:
         (out / name).write_bytes(content)
-    scene = read_scene(out)
+    scene = Scene(out)
     assert len(scene.notes) == 1
     assert said in scene.notes[0]
     assert (scene.surface is None) == (name == "mesh.glb")
@@ -77,7 +77,7 @@ def test_damaged_file_is_refused(result_of, name):
     out = result_of(2)
     (out / name).write_bytes(b"nonsense")
     with pytest.raises(InputError) as caught:
-        read_scene(out)
+        Scene(out)
     assert str(out / name) in caught.value.where
 
 
@@ -88,13 +88,13 @@ def test_origin_is_shifted_far_from_zero(result_of):
     rows = [line.split() for line in text if line]
     moved = [[row[0], str(500_000.0 + float(row[1])), *row[2:]] for row in rows]
     (out / "trajectory.tum").write_text("".join(" ".join(row) + "\n" for row in moved))
-    scene = read_scene(out)
+    scene = Scene(out)
     assert (scene.origin == np.round(scene.origin)).all()
     assert np.abs(scene.poses[:, :3, 3] - scene.origin).max() < 10.0
 
 
 def test_default_view_shows_the_whole_scene(result_of):
-    flat, space = read_scene(result_of(2)), read_scene(result_of(3))
+    flat, space = Scene(result_of(2)), Scene(result_of(3))
     above = default_view(flat)
     x0, y0, x1, y1 = flat.map_image.window
     center = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.results.colors import BLUE, ORANGE, TEAL
-from stillmap.results.viewer.scene import read_scene
+from stillmap.results.viewer.scene import Scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
@@ -21,7 +21,7 @@ def node(window, path):
 
 def test_show_scan(result_of, beams_of, opened):
     out = result_of(3, with_models=True)
-    scene, beams = read_scene(out), beams_of(out)
+    scene, beams = Scene(out), beams_of(out)
     window = opened(scene, beams)
     for scan in (2, 5, 0):
         window.show(scan)
@@ -52,7 +52,7 @@ def test_default_layers_with_a_surface(window):
 def test_default_layers_in_2d(result_of, beams_of, opened):
     """Dynamic points come from the recording, above the map."""
     out = result_of(2)
-    scene, beams = read_scene(out), beams_of(out)
+    scene, beams = Scene(out), beams_of(out)
     flat = opened(scene, beams)
     shown = {name for name, box in flat._boxes.items() if box.value}
     assert shown == {"Map", "Dynamic points", "Robot", "Beams", "Objects"}

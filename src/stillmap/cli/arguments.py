@@ -19,15 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.core.config import (
-    OptionInfo,
-    iter_options,
-    load_toml,
-    merge_nested,
-    nest,
-    override,
-    parse_assignment,
-)
+from stillmap.core import config
 from stillmap.core.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
@@ -160,16 +152,16 @@ def _settings_of_option(name: str) -> dict[str, Any]:
     return settings | {"type": _KINDS.get(kind, str), "metavar": unit}
 
 
-def _find_option(name: str) -> OptionInfo:
+def _find_option(name: str) -> config.OptionInfo:
     """An option by name; all but those of reading take long to load."""
     if name.startswith("read."):
         from stillmap.prepare.options import ReadOptions
 
-        options = iter_options(ReadOptions(), "read.")
+        options = config.iter_options(ReadOptions(), "read.")
     else:
         from stillmap.pipeline.options import DEFAULTS
 
-        options = iter_options(DEFAULTS)
+        options = config.iter_options(DEFAULTS)
     return next(info for info in options if info.name == name)
 
 
@@ -187,7 +179,7 @@ def flag_changes(args: argparse.Namespace) -> dict[str, Any]:
             x, y, degrees = offset
             keys = (f"read.{laser}_x", f"read.{laser}_y", f"read.{laser}_theta")
             named |= zip(keys, (x, y, math.radians(degrees)), strict=True)
-    return nest(named)
+    return config.nest(named)
 
 
 def options_from_args(args: argparse.Namespace) -> "Options":
@@ -200,9 +192,11 @@ def options_from_args(args: argparse.Namespace) -> "Options":
 
     options = Options()
     if args.config:
-        options = override(options, load_toml(Path(args.config)), args.config)
-    options = override(options, merge_nested(*map(parse_assignment, args.assignments)), "--set")
-    return override(options, flag_changes(args))
+        options = config.override(options, config.load_toml(Path(args.config)), args.config)
+    options = config.override(
+        options, config.merge_nested(*map(config.parse_assignment, args.assignments)), "--set"
+    )
+    return config.override(options, flag_changes(args))
 
 
 def read_options(args: argparse.Namespace) -> "ReadOptions":
@@ -211,7 +205,7 @@ def read_options(args: argparse.Namespace) -> "ReadOptions":
 
     if getattr(args, "config", None) or getattr(args, "assignments", None):
         return options_from_args(args).read
-    return override(ReadOptions(), flag_changes(args).get("read", {}))
+    return config.override(ReadOptions(), flag_changes(args).get("read", {}))
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import get_args
 from stillmap.cli.arguments import flag_changes, require_apart
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import require_new, require_new_file, workplace
+from stillmap.core.files import require_new_file, workplace
 from stillmap.core.grid_map import limit_hits
 from stillmap.io import writers
 from stillmap.io.ros.messages import BagKind
@@ -63,12 +63,10 @@ def _convert_to_nav2(
         flag = next(iter(_given_zone_flags(args)))
         hint = f"FILE is a folder; if it shall be called so, give --to {NAV2}"
         raise InputError(f"{flag} is for maps and masks of nav2", where=str(output), hint=hint)
-    require_new(output, nav2.PARAMETERS, args.overwrite)
-    rule = _traffic_rule(args)
+    traffic = _traffic_zones(args)
     drawn = zones.read_zones(Path(args.mask)) if args.mask is not None else []
-    is_traffic = rule.keepout is not None or rule.slow is not None
-    crossings = reader.read_crossings(result.folder) if is_traffic else None
-    maps = nav2.make_maps(reader.read_grid(result.folder), drawn, rule, crossings)
+    crossings = reader.read_crossings(result.folder) if traffic else None
+    maps = nav2.Maps(reader.read_grid(result.folder), traffic, crossings, drawn)
     nav2.write(maps, output, result.output_options.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
@@ -78,14 +76,18 @@ def _convert_to_nav2(
     return maps.warnings, ", ".join(written)
 
 
-def _traffic_rule(args: argparse.Namespace) -> nav2.TrafficRule:
+def _traffic_zones(args: argparse.Namespace) -> list[nav2.TrafficZone]:
     for flag, value in _given_zone_flags(args).items():
         if isinstance(value, int) and value < 1:
             raise InputError(f"{flag} is a number of crossings, from 1 on, not {value}")
     if args.slow_to is not None and args.slow_crossings is None:
         raise InputError("--slow-to needs --slow-crossings")
     limit = zones.parse_speed_limit("50%" if args.slow_to is None else args.slow_to, "--slow-to")
-    return nav2.TrafficRule(args.keepout_crossings, args.slow_crossings, limit)
+    wanted = (
+        (args.keepout_crossings, zones.Zone("traffic", "keepout", None, [])),
+        (args.slow_crossings, zones.Zone("traffic", "speed", limit, [])),
+    )
+    return [nav2.TrafficZone(least, zone) for least, zone in wanted if least is not None]
 
 
 def _convert_to_table(args: argparse.Namespace, result: ResultFolder, output: Path) -> str:

@@ -78,17 +78,17 @@ def _score_labels(args: argparse.Namespace) -> dict[str, Any]:
 
 def _score_map(args: argparse.Namespace) -> dict[str, Any]:
     import numpy as np
-    from numpy.typing import NDArray
 
     from stillmap.core import se2
+    from stillmap.core.array_types import Float
     from stillmap.core.grid_map import is_inside
     from stillmap.results.eval import map as maps
     from stillmap.results.eval.readers import Truth, read_truth
     from stillmap.results.eval.trajectory import align, planar, read_paired_poses
-    from stillmap.results.folder import read_region
-    from stillmap.results.reader import moved, read_grid, require_there
+    from stillmap.results.folder import ResultFolder
+    from stillmap.results.reader import is_result, moved, read_grid, read_run, require_there
 
-    def align_result(result: Path, truth: Truth) -> NDArray[np.float64]:
+    def align_result(result: Path, truth: Truth) -> Float:
         """T_world_map, whose map frame starts at the first pose."""
         poses, true_poses = read_paired_poses(result, truth)
         return align(planar(poses), true_poses)
@@ -105,7 +105,8 @@ def _score_map(args: argparse.Namespace) -> dict[str, Any]:
         other = read_truth(Path(args.reference_truth)) if args.reference_truth else truth
         T_world_other = align_result(Path(args.reference), other)
         targets = maps.extract_wall_cells(read_grid(Path(args.reference)), walls, T_world_other)
-    region = read_region(result)
+    record = read_run(result) if is_result(result) else {}
+    region = ResultFolder(result, record).output_options.region
     if region is not None:
         targets = targets[is_inside(moved(se2.inverse(T_world_map), targets), region)]
     # things brought in that stay are not ghosts

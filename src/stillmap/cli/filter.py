@@ -25,9 +25,7 @@ from stillmap.cli.convert import NAMES
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from stillmap.core.array_types import Bool, Float32
     from stillmap.core.recording import Recording
     from stillmap.io.filter_writers import FilterTarget
     from stillmap.results.folder import ResultFolder
@@ -51,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
-    from stillmap.io import filter_writers, writers
+    from stillmap.io import writers
     from stillmap.results.folder import open_result
     from stillmap.results.reader import is_place
 
@@ -65,7 +63,6 @@ def run(args: argparse.Namespace) -> int:
             result = open_result(folder, args.input)
             target = _find_target(result, output, args.to)
             writers.require_free(output, target.marker, args.overwrite)
-            filter_writers.require_outside(output, result.sources[0])
             summary = _write_filtered(result, target, output, "", args)
     if args.json:
         print_json({"output": str(output), **summary})
@@ -122,7 +119,6 @@ def _plan_session(
     file = name + filter_writers.find_ending(source, to)
     for path in result.sources:
         require_apart(output, path, place)
-        filter_writers.require_outside(output, path)
     return result, file, _find_target(result, output / file, to)
 
 
@@ -138,6 +134,7 @@ def _find_target(result: "ResultFolder", output: Path, to: str | None) -> "Filte
     source = result.require_source()
     for path in result.sources:
         require_apart(output, path, result.folder)
+        filter_writers.require_outside(output, path)
     target = filter_writers.find_target(source if len(result.sources) == 1 else None, output, to)
     if target.writer is not None:
         sensors = result.record["input"].get("sensors")
@@ -209,8 +206,8 @@ def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget
 
 
 def _select_beams(
-    recording: "Recording", p_static: "NDArray[np.float32]", below: float, scratch: Path
-) -> "tuple[NDArray[np.bool_], int, int]":
+    recording: "Recording", p_static: "Float32", below: float, scratch: Path
+) -> "tuple[Bool, int, int]":
     """(M,) the beams to blank; how many hit something, and how many of these are blanked."""
     import numpy as np
 

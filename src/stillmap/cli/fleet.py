@@ -134,6 +134,6 @@ def _print_summary(fleet: "Fleet", output: str) -> None:
     done = sum(job.outcome.is_done for job in fleet.jobs)
     say(f"mapped {done} of {len(fleet.jobs)} recordings")
     if fleet.places:
-        merged = sum(place.is_done for place in fleet.places)
+        merged = sum(place.outcome.is_done for place in fleet.places)
         say(f"merged {merged} of {len(fleet.places)} places")
     say(f"wrote {output}: open {output.rstrip('/')}/fleet.html")

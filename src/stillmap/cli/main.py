@@ -8,22 +8,9 @@ import os
 import sys
 from contextlib import suppress
 
-from stillmap.cli.console import (
-    EXIT_INTERRUPTED,
-    EXIT_TERMINATED,
-    fail,
-    handle_signals,
-    in_flags,
-    say,
-    write_line,
-)
+from stillmap.cli import console
 from stillmap.cli.parser import EXIT_INPUT, parser
-from stillmap.core.errors import (
-    InputError,
-    is_out_of_memory,
-    memory_error,
-    printable,
-)
+from stillmap.core import errors
 
 EXIT_DEFECT = 1
 _M_ARENA_MAX, _HEAPS = -8, 2  # parameter of glibc's mallopt, and heaps for all threads
@@ -36,7 +23,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
-        handle_signals(main.__code__)
+        console.handle_signals(main.__code__)
         _share_heaps()
         status: int = args.run(args)
         if sys.stdout is not None:  # None: closed before the start
@@ -59,19 +46,19 @@ def _share_heaps() -> None:
 def _report_failure(error: Exception) -> int:
     """Print why the command failed; the exit status."""
     # a clean-up may fail, too, as on a terminal that has gone
-    error = memory_error(error) if is_out_of_memory(error) else error
+    error = errors.memory_error(error) if errors.is_out_of_memory(error) else error
     cause = _find_interrupt(error)
     if cause is not None:
-        return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
-    if isinstance(error, InputError):
-        fail(str(in_flags(error)))
+        return console.EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
+    if isinstance(error, errors.InputError):
+        console.fail(str(console.in_flags(error)))
     elif isinstance(error, BrokenPipeError):
         # the reader of stdout has closed it: not an error
         _drop_stdout()
         return 0
     elif isinstance(error, OSError):
         # a full disk behind stdout, or a file that vanished while it was read
-        fail(f"{error.filename or 'the output'}: {error.strerror or error}")
+        console.fail(f"{error.filename or 'the output'}: {error.strerror or error}")
         _drop_stdout()
     else:
         _report_defect(error)
@@ -90,7 +77,7 @@ class _Handler(logging.Handler):
     """Print log messages like all others, above a progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        say(record.getMessage())
+        console.say(record.getMessage())
 
 
 def _set_up_logging(args: argparse.Namespace) -> None:
@@ -105,8 +92,8 @@ def _report_defect(error: Exception) -> None:
     import traceback
 
     for line in "".join(traceback.format_exception(error)).splitlines():
-        write_line(printable(line))
-    fail("this is a defect of stillmap: please report it, with the lines above")
+        console.write_line(errors.printable(line))
+    console.fail("this is a defect of stillmap: please report it, with the lines above")
 
 
 def _find_interrupt(error: BaseException | None) -> BaseException | None:
@@ -121,8 +108,8 @@ def _find_interrupt(error: BaseException | None) -> BaseException | None:
 
 
 def _report_interrupt() -> int:
-    say("interrupted, nothing was half-written")
-    return EXIT_INTERRUPTED
+    console.say("interrupted, nothing was half-written")
+    return console.EXIT_INTERRUPTED
 
 
 def _drop_stdout() -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.cli.console import list_files, say, show_share
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.errors import InputError, MissingExtra, advise, split_advice
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
@@ -40,7 +40,7 @@ class Inputs(NamedTuple):
 
     recording: Recording
     options: Options
-    poses: NDArray[np.float64] | None
+    poses: Float | None
     tilting: Recording | None
 
 
@@ -51,8 +51,7 @@ def read_inputs(args: argparse.Namespace, options: Options, scratch: Path) -> In
         InputError: something cannot be read, or the inputs do not follow each other.
     """
     with show_share(args.quiet, "reading") as progress:
-        source = args.input if len(args.input) > 1 else args.input[0]
-        recording = inputs.read(source, options.read, progress=progress, scratch=scratch)
+        recording = inputs.read(args.input, options.read, progress=progress, scratch=scratch)
     if len(args.input) > 1 and not args.quiet:
         say(f"{len(args.input)} parts of one run, in the order of their stamps")
     if args.no_odometry:
@@ -254,7 +253,7 @@ def print_summary(
     say(f"see it over time: stillmap view {shlex.quote(str(output))}")
 
 
-def _describe_hits(recording: Recording, p_static: NDArray[np.float32]) -> str:
-    counts = count_beams(recording, p_static)
+def _describe_hits(recording: Recording, p_static: Float32) -> str:
+    counts = count_beams(recording.hit, p_static)
     share = 100.0 * counts["dynamic"] / max(counts["hits"], 1)
     return f"{counts['hits']} beams that hit something, {share:.1f} % of them dynamic"

@@ -19,11 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli import arguments
 from stillmap.cli.console import list_files, print_json, say, show_progress
-from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.places.finish import PlaceResult
-    from stillmap.places.merge import MergeJob
 
 
 FLAGS = f"""
@@ -42,36 +40,23 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: an input or the output is at fault, or fewer than two sessions could be placed.
     """
-    from stillmap.core.files import require_new
-    from stillmap.places.inputs import list_sessions
-    from stillmap.places.merge import MergeJob, merge_sessions
-    from stillmap.results.reader import RECORD, is_place
-    from stillmap.results.timeline import read_sessions
+    from stillmap.places.merge import merge_sessions, plan_merge
 
     options, output = arguments.options_from_args(args), Path(args.output)
-    base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
-    paths = args.input if base is None else args.input[1:]
-    if not paths:
-        raise InputError("names no session to add", where=args.input[0])
-    require_new(output, RECORD, args.overwrite)
-    for path in args.input:
-        arguments.require_apart(output, Path(path))
-    taken = [] if base is None else [session.name for session in read_sessions(base)]
-    sessions = list_sessions([[path] for path in paths], taken)
-    job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
+    job = plan_merge(args.input, options, args.frame, args.map_state, not args.no_odometry)
     with (
         arguments.make_parents(output),
         show_progress(args.quiet, options.em.max_iterations) as progress,
     ):
         result = merge_sessions(job, output, args.overwrite, progress)
     if not args.quiet:
-        _print_summary(job, result, output)
+        _print_summary(result, args.map_state, output)
     if args.json:
         print_json(_summarize(result, output))
     return 0
 
 
-def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None:
+def _print_summary(result: "PlaceResult", map_state: str, output: Path) -> None:
     """Print which sessions were placed, what changed, and where the result lies."""
     sessions, ties = result.place.sessions, result.place.ties
     say(f"{len(sessions)} sessions in one map, {len(ties)} constraints between them")
@@ -81,7 +66,7 @@ def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None
     words = {"appeared": "appeared", "gone": "are gone", "moved": "moved", "door": "are doors"}
     counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kind in kinds]
     what = f"{len(kinds)} changes between sessions: {', '.join(counts)}"
-    say(f"{what}; the map shows {job.map_state}" if kinds else "nothing changed between sessions")
+    say(f"{what}; the map shows {map_state}" if kinds else "nothing changed between sessions")
     say(f"wrote {output}")
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.json import to_jsonable
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
@@ -25,7 +26,8 @@ _SENSOR_NOTES = (
 
 def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
-    source, times = recording.source, recording.beam_time
+    source = recording.source
+    has_times = recording.beam_time is not None and recording.n_beams > 0
     notes = to_jsonable(asdict(source))
     return {
         "dimension": recording.dimension,
@@ -36,9 +38,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
         "part": to_jsonable(source.to_dict().get("part") or {}),
-        "beam_times_s": [float(times.min()), float(times.max())]
-        if times is not None and len(times)
-        else None,
+        "beam_times_s": list(recording.beam_time_span) if has_times else None,
         "spin": None if source.spin is None else source.spin.direction,
         "odometry": _summarize_odometry(recording, source.odometry),
         "recorded_poses": _summarize_path(recording.T_recorded_base),
@@ -48,7 +48,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _sample_hit_ranges(recording: Recording) -> NDArray[np.float32]:
+def _sample_hit_ranges(recording: Recording) -> Float32:
     """Ranges of the hits, m; of a sample of them in huge recordings."""
     sample, parts = arrays.sample_indices(recording.n_beams, _MAX_SAMPLE), [np.empty(0, "f4")]
     for part in arrays.split_by_block(sample, arrays.BLOCK):
@@ -79,7 +79,7 @@ def _count_beams(recording: Recording) -> dict[str, Any]:
     return {**counts, "shares": {name: count / total for name, count in counts.items()}}
 
 
-def _summarize_time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
+def _summarize_time(stamp_ns: Int64) -> dict[str, Any] | None:
     if len(stamp_ns) == 0:
         return None
     first, last = int(stamp_ns[0]), int(stamp_ns[-1])
@@ -108,7 +108,7 @@ def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str
     }
 
 
-def _step_lengths(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _step_lengths(T: Float) -> tuple[Float, Float]:
     """(T-1,) distances, m, and rotations, degrees, between consecutive poses."""
     step = se2.increments(T)
     # the angle of a rotation in any dimension follows from its trace
@@ -118,7 +118,7 @@ def _step_lengths(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return metres, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _summarize_path(T: NDArray[np.float64] | None) -> dict[str, Any] | None:
+def _summarize_path(T: Float | None) -> dict[str, Any] | None:
     if T is None:
         return None
     metres, degrees = _step_lengths(T)
@@ -178,9 +178,7 @@ def _summarize_sensor(recording: Recording, numbers: range, noted: SensorNotes) 
     return out
 
 
-def _field_of_view(
-    recording: Recording, scans: NDArray[np.intp], noted: SensorNotes
-) -> list[float] | None:
+def _field_of_view(recording: Recording, scans: Index, noted: SensorNotes) -> list[float] | None:
     """First and last beam angle, degrees: as noted, else the extremes of all usable beams."""
     first, step, n = noted.start_angle, noted.angle_step, noted.beams_per_scan
     if first is not None and step is not None and n is not None:

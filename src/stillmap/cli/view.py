@@ -16,7 +16,6 @@ import argparse
 import os
 import sys
 import threading
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -115,14 +114,14 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
         InputError: a file of the result is damaged, or the recording that was named is another.
     """
     from stillmap.results.reader import is_place
-    from stillmap.results.viewer.scene import read_scene
+    from stillmap.results.viewer.scene import Scene
     from stillmap.results.viewer.window import Window
 
     if is_place(folder):
         if args.input:
             what = "is a place, which has many recordings"
             raise InputError(what, where=str(folder), hint="--input is for single results")
-        scene, beams = read_scene(folder), None
+        scene, beams = Scene(folder), None
     else:
         scene, beams = _read_result(args, folder)
     window = Window(scene, beams, args.port)
@@ -142,10 +141,10 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
 def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beams | None"]:
     """The result of one recording; without beams where that cannot be read and is not named."""
     from stillmap.results.folder import open_result
-    from stillmap.results.viewer.scene import Beams, read_scene
+    from stillmap.results.viewer.scene import Beams, Scene
 
     result = open_result(folder, args.input)
-    scene = read_scene(folder, result.sources[0].name)
+    scene = Scene(folder, result.sources[0].name)
     if args.no_beams:
         return scene, None
     try:
@@ -159,4 +158,5 @@ def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beam
             raise
         note = f"without beams: {in_flags(error)}"
         say(note)
-        return replace(scene, notes=[f"W{note[1:]}", *scene.notes]), None
+        scene.notes.insert(0, f"W{note[1:]}")
+        return scene, None

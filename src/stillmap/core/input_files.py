@@ -130,10 +130,12 @@ def read_text(path: Path, max_bytes: int) -> str:
     """The content of a UTF-8 file of at most `max_bytes` bytes.
 
     Raises:
-        InputError: it cannot be read, or is larger.
-        UnicodeDecodeError: it is not UTF-8.
+        InputError: it cannot be read, is larger, or no text.
     """
-    return read_bytes(path, max_bytes).decode("utf-8")
+    try:
+        return read_bytes(path, max_bytes).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=str(path)) from error
 
 
 def copy_content(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:

@@ -77,6 +77,11 @@ def print_line(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def prefix_steps(progress: Progress, of: str) -> Progress:
+    """A Progress that says of what each step is."""
+    return lambda stage, *counts: progress(f"{of}: {stage}", *counts)
+
+
 def show_iterations(show: Show, iterations: int) -> Progress:
     """A Progress that shows steps, of EM with its iteration, of at most so many."""
 

@@ -184,6 +184,15 @@ class Recording(ShortRepr):
             **{name: array[rows] for name, array in given.items()},
         )
 
+    @property
+    def beam_time_span(self) -> tuple[float, float]:
+        """Seconds from a scan's stamp to its first and to its last beam, over all scans."""
+        times = self.beam_time
+        if times is None or not len(times):
+            return 0.0, 0.0
+        parts = [(float(times[b].min()), float(times[b].max())) for b in arrays.iter_blocks(times)]
+        return min(low for low, _ in parts), max(high for _, high in parts)
+
     def without_odometry(self) -> Recording:
         """The recording without odometry."""
         return replace(self, T_odom_base=None)

@@ -76,6 +76,20 @@ def wrap(angle: ArrayLike) -> Float:
     return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
 
 
+def align_points(source: Float, target: Float) -> Float:
+    """(D+1, D+1) rigid T that minimises sum |target - T source|^2 over (N, D) points, N >= 1."""
+    centre_source, centre_target = source.mean(0), target.mean(0)
+    U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
+    D = source.shape[1]
+    # keep R a rotation: the last axis costs least to reverse
+    flip = np.ones(D)
+    flip[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    T = np.eye(D + 1)
+    T[:D, :D] = (U * flip) @ Vt
+    T[:D, D] = centre_target - T[:D, :D] @ centre_source
+    return T
+
+
 def rotate_covariance(covariance: Float, T: Float) -> Float:
     """Rotate covariances (..., 3, 3) of x, y, theta by the rotations of poses (..., 3, 3)."""
     R = np.zeros(T.shape)

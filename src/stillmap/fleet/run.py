@@ -14,17 +14,7 @@ from stillmap.core.files import atomic_file, package_version, resolve_output, to
 from stillmap.core.input_files import hold_lock
 from stillmap.core.json import to_json
 from stillmap.core.profiling import Show
-from stillmap.fleet.inputs import (
-    Entry,
-    Source,
-    absolute,
-    explain,
-    find_sources,
-    is_folder_name,
-    is_local,
-    name_sources,
-    open_location,
-)
+from stillmap.fleet import inputs
 from stillmap.fleet.tasks import PLACES, RESULTS, STAGING, Outcome, Task, read_made, run_task
 from stillmap.results.report import template
 
@@ -52,7 +42,7 @@ class Request(NamedTuple):
         progress: takes what is done, and how many of how many have ended.
     """
 
-    entries: Sequence[Entry]
+    entries: Sequence[inputs.Entry]
     output: str
     command: Callable[[list[str]], None]
     fail: Callable[[str], None]
@@ -66,29 +56,16 @@ class Request(NamedTuple):
 class Job(NamedTuple):
     """A recording, and how mapping it ended."""
 
-    source: Source
+    source: inputs.Source
     outcome: Outcome
 
 
 class Place(NamedTuple):
-    """A place, its recordings, and how merging their results ended; None: too few to merge."""
+    """A place, its recordings, and how merging their results ended."""
 
     name: str
     jobs: list[Job]
-    outcome: Outcome | None
-
-    @property
-    def is_done(self) -> bool:
-        """True if its result exists."""
-        return self.outcome is not None and self.outcome.is_done
-
-    @property
-    def why(self) -> str:
-        """Why there is no result."""
-        if self.outcome is not None:
-            return self.outcome.why
-        n = sum(job.outcome.is_done for job in self.jobs)
-        return f"merging takes two maps, this place has {n or 'none'}"
+    outcome: Outcome
 
 
 class Fleet(NamedTuple):
@@ -100,10 +77,8 @@ class Fleet(NamedTuple):
     @property
     def failed(self) -> int:
         """How many recordings and places failed."""
-        merged = [place.outcome for place in self.places if place.outcome is not None]
-        return sum(
-            not outcome.is_done for outcome in [*(job.outcome for job in self.jobs), *merged]
-        )
+        outcomes = [one.outcome for one in (*self.jobs, *self.places)]
+        return sum(outcome.status == "failed" for outcome in outcomes)
 
     def to_list(self) -> list[dict[str, Any]]:
         """The content of `fleet.json`: an entry for each recording."""
@@ -113,11 +88,9 @@ class Fleet(NamedTuple):
 
 def _describe(job: Job, place: Place | None) -> dict[str, Any]:
     source, outcome = job.source, job.outcome
-    merged = place is not None and place.is_done
+    merged = place is not None and place.outcome.is_done
     return {
-        "input": source.input,
-        "name": source.name,
-        "place": source.place,
+        **source._asdict(),
         "status": outcome.status,
         "why": outcome.why,
         "result": f"{RESULTS}/{source.name}" if outcome.is_done else None,
@@ -125,7 +98,7 @@ def _describe(job: Job, place: Place | None) -> dict[str, Any]:
         "peak_memory_bytes": outcome.peak_memory_bytes,
         **{name: outcome.summary.get(name) for name in _FACTS},
         "place_result": f"{PLACES}/{source.place}" if merged else None,
-        "place_why": "" if place is None or merged else place.why,
+        "place_why": "" if place is None or merged else place.outcome.why,
     }
 
 
@@ -138,13 +111,13 @@ def run_fleet(request: Request) -> Fleet:
             the same request goes on from there.
         KeyboardInterrupt: likewise.
     """
-    root = absolute(request.output)
-    if is_local(request.output):
+    root = inputs.absolute(request.output)
+    if inputs.is_local(request.output):
         root = str(resolve_output(Path(root)))
     _require_fleet(root)
-    places_of = find_sources(request.entries)
+    places_of = inputs.find_sources(request.entries)
     with _hold_output(root):
-        sources = name_sources(places_of, _known_names(root))
+        sources = inputs.name_sources(places_of, _known_names(root))
         with _remove_unfinished(root, request), _open_client(request) as client:
             tasks = [
                 Task("map", source.name, (source.input,), root, request.map_flags)
@@ -161,8 +134,8 @@ def run_fleet(request: Request) -> Fleet:
 
 def _require_fleet(root: str) -> None:
     """Refuse an output that holds other things than a fleet."""
-    fs, path = open_location(root)
-    with explain(root, "read"):
+    fs, path = inputs.open_location(root)
+    with inputs.explain(root, "read"):
         if not fs.exists(path):
             return
         if not fs.isdir(path):
@@ -180,10 +153,10 @@ def _hold_output(root: str) -> Iterator[None]:
     Raises:
         InputError: another fleet is writing there, or nothing can be written.
     """
-    fs, path = open_location(root)
-    if not is_local(root):
+    fs, path = inputs.open_location(root)
+    if not inputs.is_local(root):
         _write(root, _LOCK, "")
-        with explain(root, "written"):
+        with inputs.explain(root, "written"):
             fs.rm_file(f"{path}/{_LOCK}")
         yield
         return
@@ -201,12 +174,14 @@ def _hold_output(root: str) -> Iterator[None]:
 
 def _known_names(root: str) -> dict[str, str]:
     """The names of the results that are there, by input."""
-    fs, path = open_location(root)
+    fs, path = inputs.open_location(root)
     folder = f"{path}/{RESULTS}"
-    with explain(root, "read"):
+    with inputs.explain(root, "read"):
         paths = fs.ls(folder, detail=False) if fs.isdir(folder) else []
     names = [str(path).rstrip("/").rpartition("/")[2] for path in paths]
-    known = {name: read_made(root, f"{RESULTS}/{name}") for name in names if is_folder_name(name)}
+    known = {
+        name: read_made(root, f"{RESULTS}/{name}") for name in names if inputs.is_folder_name(name)
+    }
     return {made.input: name for name, made in known.items() if made is not None}
 
 
@@ -218,8 +193,8 @@ def _remove_unfinished(root: str, request: Request) -> Iterator[None]:
         yield
         ended = True
     finally:
-        folder = Path(open_location(root)[1])
-        for path in folder.glob(f"*/{STAGING}*") if ended and is_local(root) else ():
+        folder = Path(inputs.open_location(root)[1])
+        for path in folder.glob(f"*/{STAGING}*") if ended and inputs.is_local(root) else ():
             shutil.rmtree(path, ignore_errors=True)
 
 
@@ -324,27 +299,29 @@ def _merge_places(client: Any, jobs: Sequence[Job], root: str, request: Request)
     for job in jobs:
         if job.source.place is not None:
             members.setdefault(job.source.place, []).append(job)
-    tasks = []
+    tasks, outcomes = [], dict[str, Outcome]()
     for name, of_place in members.items():
         done = [job for job in of_place if job.outcome.is_done]
         if len(done) < 2:
+            why = f"merging takes two maps, this place has {len(done) or 'none'}"
+            outcomes[name] = Outcome("too few", why)
             continue
         sources = tuple(job.source.input for job in done)
         results = tuple(job.source.name for job in done)
         keys = tuple(job.outcome.key for job in done)
         tasks.append(Task("merge", name, sources, root, request.merge_flags, results, keys))
-    outcomes = _run_tasks(client, tasks, request)
-    return [Place(name, of_place, outcomes.get(name)) for name, of_place in members.items()]
+    outcomes |= _run_tasks(client, tasks, request)
+    return [Place(name, of_place, outcomes[name]) for name, of_place in members.items()]
 
 
 def _write(root: str, name: str, text: str) -> None:
     """Write a file of the fleet, whole or not at all."""
-    fs, path = open_location(root)
-    if is_local(root):
+    fs, path = inputs.open_location(root)
+    if inputs.is_local(root):
         with atomic_file(Path(path, name)) as work:
             work.write_text(text, encoding="utf-8")
         return
-    with explain(f"{root}/{name}", "written"):
+    with inputs.explain(f"{root}/{name}", "written"):
         fs.pipe_file(f"{path}/{name}", text.encode())
 
 

@@ -44,7 +44,8 @@ class Outcome:
     """The outcome of a task.
 
     Attributes:
-        status: `done`, `failed`, or `full`: a disk is, and no task can go on.
+        status: `done`, `failed`, `full`: a disk is, and no task can go on; or `too few` results
+            to be merged.
         why: one line; empty where it is done.
         key: of what the result was made from.
         input: its recording, or the first of them.
@@ -53,7 +54,7 @@ class Outcome:
         summary: of the result, JSON-able.
     """
 
-    status: Literal["done", "failed", "full"]
+    status: Literal["done", "failed", "full", "too few"]
     why: str = ""
     key: str = ""
     input: str = ""
@@ -213,9 +214,9 @@ def _replace_in_files(folder: Path, texts: dict[str, str]) -> None:
     """Replace paths, which need no escapes, in the JSON and HTML files of a result."""
     for path in folder.rglob("*"):
         if path.suffix in (".json", ".html") and path.is_file():
-            escape = html.escape if path.suffix == ".html" else _escape_json
-            text = read_text(path, _MAX_BYTES)
-            replaced = _replace(text, {old: escape(new) for old, new in texts.items()})
+            is_html, text = path.suffix == ".html", read_text(path, _MAX_BYTES)
+            escaped = {k: html.escape(v) if is_html else to_json(v)[1:-1] for k, v in texts.items()}
+            replaced = _replace(text, escaped)
             if replaced != text:
                 write_text(path, replaced)
 
@@ -224,10 +225,6 @@ def _replace(text: str, texts: dict[str, str]) -> str:
     for old, new in texts.items():
         text = text.replace(old, new)
     return text
-
-
-def _escape_json(text: str) -> str:
-    return to_json(text)[1:-1]
 
 
 def _summarize(folder: Path) -> dict[str, Any]:

@@ -3,13 +3,13 @@ ns), matrices, quaternions; poses at stamps."""
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2, se3
-from stillmap.core.array_types import Bool, Float, Int64
+from stillmap.core.array_types import Bool, Float, Index, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
@@ -18,6 +18,8 @@ from stillmap.core.timestamps import format_seconds, parse_ns
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
+
+Number = TypeVar("Number", np.int64, np.float64)
 
 MAX_BYTES = 128 << 20  # of a file: four hours at 100 Hz
 
@@ -128,11 +130,7 @@ def read_tum(path: Path) -> tuple[Int64, Float]:
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    try:
-        text = read_text(path, MAX_BYTES)
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=str(path)) from error
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path, MAX_BYTES).splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -243,7 +241,7 @@ def poses_from_tum(path: Path, recording: Recording) -> Float:
     if np.array_equal(stamp_ns, recording.stamp_ns):
         return poses
     order = np.argsort(stamp_ns, kind="stable")
-    nearest = order[_nearest_index(stamp_ns[order], recording.stamp_ns)]
+    nearest = order[nearest_index(stamp_ns[order], recording.stamp_ns)]
     missing = np.flatnonzero(np.abs(stamp_ns[nearest] - recording.stamp_ns) > _TOLERANCE_NS)
     if len(missing):
         first = f"the first is scan {missing[0]} at {recording.stamp_ns[missing[0]] / 1e9:.3f} s"
@@ -254,9 +252,11 @@ def poses_from_tum(path: Path, recording: Recording) -> Float:
     return poses[nearest]
 
 
-def _nearest_index(sorted_ns: Int64, wanted_ns: Int64) -> Int64:
-    last = len(sorted_ns) - 1
-    right = np.clip(np.searchsorted(sorted_ns, wanted_ns), min(last, 1), last)
+def nearest_index(ordered: NDArray[Number], wanted: NDArray[Number]) -> Index:
+    """(K,) index of the nearest of rising numbers (N,), N >= 1, to each one wanted (K,), such as
+    stamps; of two equally near ones the earlier."""
+    last = len(ordered) - 1
+    right = np.clip(np.searchsorted(ordered, wanted), min(last, 1), last)
     left = np.maximum(right - 1, 0)
-    closer_left = wanted_ns - sorted_ns[left] <= sorted_ns[right] - wanted_ns
+    closer_left = wanted - ordered[left] <= ordered[right] - wanted
     return np.where(closer_left, left, right)

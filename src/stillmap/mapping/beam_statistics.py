@@ -8,19 +8,22 @@ from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 
 
-def count_beams(recording: Recording, p_static: Float32) -> dict[str, int]:
-    """Count `beams`, `hits`, `max_range`, `unusable`, and `dynamic` (hits with p_static < 0.5)."""
-    hits = unusable = dynamic = 0
-    for block in iter_blocks(recording.points, recording.hit, p_static):
-        hit = recording.hit[block]
-        hits += int(np.count_nonzero(hit))
-        unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
-        dynamic += int(np.count_nonzero(hit & (p_static[block] < DYNAMIC_BELOW)))
-    beams = recording.n_beams
+def count_beams(hit: Bool, p_static: Float32) -> dict[str, int]:
+    """`beams`, `hits`, `max_range`, `unusable` and `dynamic` (hits with p_static < 0.5) of M beams.
+
+    Args:
+        hit: (M,) whether a beam ended on something.
+        p_static: (M,); NaN: unusable.
+    """
+    hits = dynamic = unusable = 0
+    for block in iter_blocks(hit, p_static):
+        hits += int(np.count_nonzero(hit[block]))
+        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
+        unusable += int(np.count_nonzero(np.isnan(p_static[block])))
     return {
-        "beams": beams,
+        "beams": len(hit),
         "hits": hits,
-        "max_range": beams - hits - unusable,
+        "max_range": len(hit) - hits - unusable,
         "unusable": unusable,
         "dynamic": dynamic,
     }

@@ -91,30 +91,17 @@ def final_estimate(recording: Recording, best: Estimate, options: Options) -> Fi
     changes = mapping.join_doors(changes, found_doors)
     swung = [one.door for one in changes if one.door is not None]
     lone = mapping.find_lone_doors(surface, swung, deskewed, best.poses, cell, threads)
-    best = _relabel(deskewed, best, courses, changes, lone, options, threads)
-    return FinalEstimate(deskewed, best, changes, [*swung, *lone])
-
-
-def _relabel(
-    deskewed: Recording,
-    best: Estimate,
-    courses: em.CellHistories,
-    changes: list[mapping.Change],
-    lone_doors: list[mapping.Door],
-    options: Options,
-    threads: int,
-) -> Estimate:
-    """The labels and cells of changed places and doors, in the state that the map shows."""
-    p_static, occupied = best.p_static, best.e_step.known_cells
-    state = options.output.map_state
-    p_static, occupied = mapping.relabel_changes(
-        deskewed, best.poses, p_static, occupied, courses, changes, state, threads
+    # changed places and doors as the map shows them
+    labels, state = (best.p_static, best.e_step.known_cells), options.output.map_state
+    labels = mapping.relabel_changes(
+        deskewed, best.poses, *labels, courses, changes, state, threads
     )
     p_static, occupied = mapping.relabel_lone_doors(
-        deskewed, best.poses, p_static, occupied, courses, lone_doors, state, threads
+        deskewed, best.poses, *labels, courses, lone, state, threads
     )
     learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
-    return best.with_labels(p_static=p_static, occupied=occupied, learned=learned)
+    best = best.with_labels(p_static=p_static, occupied=occupied, learned=learned)
+    return FinalEstimate(deskewed, best, changes, [*swung, *lone])
 
 
 def _add_motion_evidence(

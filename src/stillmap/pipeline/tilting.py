@@ -17,7 +17,7 @@ from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
+from stillmap.em import EmOptions, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
 from stillmap.pipeline.tilting_beams import (
@@ -126,7 +126,10 @@ def build_tilting(
     learned: dict[str, Any] = {"p_static": em_options.prior}
     static = _constant_labels(posed.deskewed, em_options.prior)
     if use_evidence:
-        evidence = _occupancy_evidence(posed, ground, em_options, threads)
+        # a voxel border is put just above the floor, so that feet share no voxel with it
+        poses = posed.poses.copy()
+        poses[:, 2, 3] -= float(np.median(ground.height_at(poses[:, :2, 3]))) + GROUND_CLEARANCE
+        evidence = occupancy_hmm.e_step(posed.deskewed, poses, _VOXEL, em_options, threads)
         static, learned = evidence.p_static, evidence.learned
     boxes = fit_boxes(
         planar.deskewed, planar.poses, planar.p_static, planar.objects, MIN_P_DYNAMIC, HOLD
@@ -145,19 +148,6 @@ def build_tilting(
         sum(len(one.beams) > 0 for one in in_boxes),
         learned,
     )
-
-
-def _occupancy_evidence(
-    posed: PosedRecording, ground: GroundMap, em_options: EmOptions, threads: int
-) -> EStepResult:
-    """The E-step of the tilting laser.
-
-    A voxel border is put just above the floor, so that feet share no voxel with it.
-    """
-    floor = float(np.median(ground.height_at(posed.poses[:, :2, 3])))
-    poses = posed.poses.copy()
-    poses[:, 2, 3] -= floor + GROUND_CLEARANCE
-    return occupancy_hmm.e_step(posed.deskewed, poses, _VOXEL, em_options, threads)
 
 
 def _constant_labels(recording: Recording, p_static: float) -> Float32:

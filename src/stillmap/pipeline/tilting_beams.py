@@ -12,6 +12,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em import GroundMap
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED
 from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box
 
@@ -89,15 +90,7 @@ def pose_recording(recording: Recording, stamp_ns: Int64, poses: Float) -> Posed
         unposed += int(np.count_nonzero(~posed))
         recording.release_pages(points, hit)
     deskewed = dataclasses.replace(recording, points=points, hit=hit, beam_time=None)
-    return PosedRecording(deskewed, lift_poses(at_scan), unposed)
-
-
-def lift_poses(poses: Float) -> Float:
-    """(T, 4, 4) upright poses at height zero, of (T, 3, 3) in the plane."""
-    out = np.zeros((len(poses), 4, 4))
-    out[:, :2, :2], out[:, :2, 3] = poses[:, :2, :2], poses[:, :2, 2]
-    out[:, 2, 2] = out[:, 3, 3] = 1.0
-    return out
+    return PosedRecording(deskewed, embed_in_3d(at_scan), unposed)
 
 
 def _transform_points(points: Float32, T_base_sensor: Float, T: Float) -> Float32:
@@ -140,7 +133,7 @@ def select_box_beams(
     """
     ends = _end_points(posed)
     seconds = 1e-9 * (recording.stamp_ns - start_ns)
-    early, late = _beam_time_span(recording)
+    early, late = recording.beam_time_span
     out = []
     for box in boxes:
         first = int(np.searchsorted(seconds, box.seconds[0] - box.hold - late))
@@ -184,15 +177,6 @@ def _end_points(posed: PosedRecording) -> Float32:
         ends[block] = np.nan
         ends[hits] = scans.end_points(hits, posed.poses)
     return ends
-
-
-def _beam_time_span(recording: Recording) -> tuple[float, float]:
-    """Seconds from a scan's stamp to its first and to its last beam, over all scans."""
-    times = recording.beam_time
-    if times is None or not len(times):
-        return 0.0, 0.0
-    parts = [(float(times[b].min()), float(times[b].max())) for b in iter_blocks(times)]
-    return min(low for low, _ in parts), max(high for _, high in parts)
 
 
 def _is_near_path(box: Box, ends: Float32, margin: float) -> Bool:

@@ -2,7 +2,7 @@
 them door leaves, which are straight, hinged, and beside a gap in a wall that they could shut."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.places.place_states import PlaceStates, are_near
+from stillmap.results.timeline import Kind
 
 # m: length of what is seen of a leaf, half its thickness with noise
 _LENGTH, _THICKNESS = (0.3, 1.6), 0.12
@@ -99,9 +100,6 @@ def _covers(depth: Float) -> bool:
     return len(filled) >= 0.75 * _POST / _STEP
 
 
-Kind = Literal["appeared", "gone", "moved", "door"]
-
-
 @dataclass(frozen=True, eq=False)
 class PlaceChange(ShortRepr):
     """Something that is otherwise from one session to the next that looked.
@@ -163,9 +161,8 @@ def detect_place_changes(place: PlaceStates) -> tuple[PlaceStates, list[PlaceCha
     place = _share_evidence(place, groups)
     out = [_make_change(group, place) for group in _find_groups(place)]
     out = _pair_positions(out, place)
-    return place, sorted(
-        out, key=lambda change: (change.after, change.before, *change.low.tolist())
-    )
+    out.sort(key=lambda change: (change.after, change.before, *change.low.tolist()))
+    return place, out
 
 
 def _find_groups(place: PlaceStates) -> list[_Events]:
@@ -211,17 +208,15 @@ def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
     for group in groups:
         of = np.unique(group.cell)
         usual = np.median(place.evidence[of], axis=0)
-        there = usual > _CLEAR
-        gone = usual < -_CLEAR
+        there, gone = usual > _CLEAR, usual < -_CLEAR
         if not there.any() or not gone.any():
             continue
         low, high = place.cells[of].min(axis=0) - 3, place.cells[of].max(axis=0) + 3
         inside = np.flatnonzero(((place.cells >= low) & (place.cells <= high)).all(axis=1))
         inside = inside[are_near(place.cells[inside], place.cells[of], _BESIDE)]
         of_each = np.where(is_static[inside, None], place.own[inside], place.evidence[inside])
-        stood = (of_each[:, there] > _CLEAR).any(axis=1)
-        seen_since = (of_each[:, gone] > _CLEAR).any(axis=1)
-        fits = stood & ~seen_since
+        stood, stands_since = ((of_each[:, s] > _CLEAR).any(axis=1) for s in (there, gone))
+        fits = stood & ~stands_since
         of_each = of_each[fits]
         evidence[inside[fits]] = np.where(np.abs(of_each) < _CLEAR, _SHARE * usual, of_each)
     changed = np.flatnonzero((evidence != place.evidence).any(axis=1))
@@ -355,10 +350,8 @@ def _find_doors(changes: list[PlaceChange], place: PlaceStates) -> set[int]:
             continue
         low, high = change.low / place.resolution - margin, change.high / place.resolution + margin
         if len(low) == 3:  # walls at the height of its upper half, without floor and lintel
-            low[2], high[2] = (
-                (0.5 * (change.low + change.high) / place.resolution)[2],
-                high[2] - margin[2],
-            )
+            low[2] = (0.5 * (change.low + change.high) / place.resolution)[2]
+            high[2] -= margin[2]
         near = static[((static >= low) & (static < high)).all(axis=1)]
         wall = (np.unique(near[:, :2], axis=0) + 0.5) * place.resolution
         if is_hinged(leaf, np.asarray(wall)):

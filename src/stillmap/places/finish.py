@@ -10,46 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core import arrays, files, input_files
+from stillmap.core.array_folder import FORMAT_VERSION, write_arrays
 from stillmap.core.array_types import Float, Float32
-from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
-from stillmap.core.files import package_version, write_text
-from stillmap.core.input_files import read_bytes
 from stillmap.core.json import write_json
 from stillmap.core.local_frame import Fields, Shift, shift, shift_poses
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.io.trajectory import MAX_BYTES, write_tum
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
+from stillmap.places import objects, place_map, store
 from stillmap.places.changes import PlaceChange, detect_place_changes
-from stillmap.places.grow import estimate_planar
 from stillmap.places.keyframes import join_keyframes
-from stillmap.places.objects import write_objects
 from stillmap.places.place import Place, PlacedSession, fit_alignment, join_constraints
-from stillmap.places.place_map import (
-    ShownState,
-    changed_cell_table,
-    label_session,
-    make_place_map,
-    show_state,
-)
 from stillmap.places.place_states import PlaceStates, estimate_place
-from stillmap.places.store import (
-    TIES,
-    read_beam_cells,
-    write_joined_beams,
-    write_placement,
-    write_ties,
-)
-from stillmap.results.map_server import write_map_npz, write_map_server
-from stillmap.results.point_cloud import write_clouds
-from stillmap.results.pose_graph_g2o import write_g2o
-from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, count_labels, read_labels
+from stillmap.results import map_server, point_cloud, pose_graph_g2o, run_json
+from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, read_labels
 from stillmap.results.report.place import render_place_report
-from stillmap.results.run_json import quality_record
 from stillmap.results.timeline import CHANGES, STATES, PlaceSession
 from stillmap.slam import PoseGraph
 
@@ -77,13 +58,8 @@ class PlaceResult(ShortRepr):
     refusals: list[PlaceSession]
     order: list[str]
     changes: list[PlaceChange]
-    shown: ShownState
-    planar: ShownState
-
-    @property
-    def names_in_time(self) -> list[str]:
-        """Names of the sessions in the order of time."""
-        return [placed.session.name for placed in self.place.in_time()]
+    shown: place_map.ShownState
+    planar: place_map.ShownState
 
 
 def finish_place(
@@ -100,15 +76,16 @@ def finish_place(
     Raises:
         InputError: the state is none that the place can show.
     """
-    limit = _find_limit(place, map_state)
-    planar_states = estimate_planar(place)
-    planar_states, planar_changes = detect_place_changes(planar_states)
-    planar = show_state(planar_states, planar_changes, limit)
-    if place.dimension == 2:
-        return PlaceResult(place, refusals, order, planar_changes, planar, planar)
-    states = estimate_place([placed.require_evidence()[0] for placed in place.in_time()])
-    states, changes = detect_place_changes(states)
-    return PlaceResult(place, refusals, order, changes, show_state(states, changes, limit), planar)
+    limit, in_time = _find_limit(place, map_state), place.in_time()
+
+    def show(k: int) -> tuple[list[PlaceChange], place_map.ShownState]:
+        states = estimate_place([placed.require_evidence()[k] for placed in in_time])
+        states, changes = detect_place_changes(states)
+        return changes, place_map.show_state(states, changes, limit)
+
+    changes, planar = show(1)
+    changes, shown = show(0) if place.dimension == 3 else (changes, planar)
+    return PlaceResult(place, refusals, order, changes, shown, planar)
 
 
 def require_map_state(map_state: str, names: Sequence[str]) -> None:
@@ -166,24 +143,26 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         _write_session(folder, result, placed, time)
     _write_place_files(folder, result)
     transforms = {placed.session.name: _between_maps(placed, by) for placed in place.sessions}
-    write_objects(folder, transforms)
+    objects.write_objects(folder, transforms)
     joined = join_keyframes([placed.session.keyframes for placed in place.sessions]).recording
     poses = np.concatenate([placed.keyframe_poses for placed in place.sessions])
     if place.dimension == 3:
         labels = np.concatenate(
             [_label_keyframes(placed, result.shown) for placed in place.sessions]
         )
-        write_clouds(folder, joined, shift_poses(poses, by.metres), labels, origin=by.metres)
+        point_cloud.write_clouds(
+            folder, joined, shift_poses(poses, by.metres), labels, origin=by.metres
+        )
     planar = [placed.require_evidence()[1] for placed in place.in_time()]
-    occupancy = make_place_map(planar, result.planar)
+    occupancy = place_map.make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)
     # labels are not rated: keyframes are too far apart for that
-    record["quality"] = quality_record(rate_geometry(joined, poses, occupancy))
+    record["quality"] = run_json.quality_record(rate_geometry(joined, poses, occupancy))
     occupancy = shift(occupancy, by, FIELDS)
-    write_map_server(folder, occupancy, options.output.map_mode)
-    write_map_npz(folder / "map.npz", occupancy)
+    map_server.write_map_server(folder, occupancy, options.output.map_mode)
+    map_server.write_map_npz(folder / "map.npz", occupancy)
     page = render_place_report(folder, occupancy, options.output.map_mode, record)
-    write_text(folder / "report.html", page)
+    files.write_text(folder / "report.html", page)
     write_json(folder / RECORD, record)
 
 
@@ -193,10 +172,9 @@ def place_record(
     """The content of `run.json` of a place; `occupancy` is its map in its local frame."""
     place, labels = result.place, read_labels(folder)
     origin = place.home.origin
-    known = int(np.count_nonzero(~np.isnan(np.asarray(occupancy.p_occupied))))
     return {
         "format_version": FORMAT_VERSION,
-        "version": package_version(),
+        "version": files.package_version(),
         "input": {
             "format": "stillmap place",
             "path": None,
@@ -206,8 +184,8 @@ def place_record(
         **({LOCAL_ORIGIN: origin.tolist()} if origin.any() else {}),
         "options": asdict(options),
         "iterations": [],
-        "counts": {"scans": len(labels.stamp_ns), **count_labels(labels.hit, labels.p_static)},
-        "area": {"known": round(known * place.resolution**2, 6)},
+        "counts": {"scans": len(labels.stamp_ns), **count_beams(labels.hit, labels.p_static)},
+        "area": {"known": run_json.known_area(occupancy)},
         "warnings": [
             f"{refusal.name} is not in the place: {refusal.why}" for refusal in result.refusals
         ],
@@ -229,10 +207,12 @@ def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, tim
     place, home = result.place, folder / "sessions" / placed.session.name
     poses = shift_poses(placed.poses, place.home.origin)
     write_tum(home / "trajectory.tum", placed.session.stamp_ns, poses)
-    beams = read_beam_cells(home, placed.session, place.voxel_size)
+    beams = store.read_beam_cells(home, placed.session, place.voxel_size)
     centres = beams.place_centres(placed.session.node_poses, placed.nodes)
-    write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
-    write_placement(home, placed)
+    arrays.write_npy(
+        home / "beams" / "p_static.npy", place_map.label_session(result.shown, beams, centres, time)
+    )
+    write_arrays(home / store.STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
 
 
 def _to_map_frame(place: Place) -> Shift:
@@ -255,7 +235,7 @@ def _between_maps(placed: PlacedSession, by: Shift, T: Float | None = None) -> F
     return shift_poses(T, by.metres)
 
 
-def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
+def _label_keyframes(placed: PlacedSession, shown: place_map.ShownState) -> Float32:
     """(M,) P(static) of the beams of a session's keyframes, as the map shows the place."""
     keyframes = placed.session.keyframes
     beams = np.flatnonzero(keyframes.recording.hit)
@@ -269,21 +249,22 @@ def _label_keyframes(placed: PlacedSession, shown: ShownState) -> Float32:
 
 def _write_place_files(folder: Path, result: PlaceResult) -> None:
     """Write the files of the place as a whole, but the map, the report and `run.json`."""
-    place, by, names = result.place, _to_map_frame(result.place), result.names_in_time
+    place, by = result.place, _to_map_frame(result.place)
+    names = [placed.session.name for placed in place.in_time()]
     homes = [folder / "sessions" / placed.session.name for placed in place.sessions]
     poses = shift_poses(np.concatenate([placed.poses for placed in place.sessions]), by.metres)
     with (folder / "trajectory.tum").open("wb") as file:
         for home in homes:
-            file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
-    write_joined_beams(folder / "beams", homes)
-    write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
+            file.write(input_files.read_bytes(home / "trajectory.tum", MAX_BYTES))
+    store.write_joined_beams(folder / "beams", homes)
+    pose_graph_g2o.write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))
     write_json(folder / CHANGES, _change_records(shift(result.changes, by, _FIELDS), names))
-    write_npz(folder / "changes.npz", _change_cells(result.changes, result.shown.place, by))
-    states = changed_cell_table(result.planar, names)
+    arrays.write_npz(folder / "changes.npz", _change_cells(result.changes, result.shown.place, by))
+    states = place_map.changed_cell_table(result.planar, names)
     states["cells"] = (states["cells"] + by.cells[:2]).astype(np.int32)
-    write_npz(folder / STATES, states)
-    write_ties(folder / TIES, place.ties, place.dimension)
+    arrays.write_npz(folder / STATES, states)
+    store.write_ties(folder / store.TIES, place.ties, place.dimension)
 
 
 def _join_graphs(place: Place) -> PoseGraph:

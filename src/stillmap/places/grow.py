@@ -4,20 +4,21 @@ M-step: constraints between keyframes given P(static), and the pose graph of all
 the evidence of each session, and the chain over sessions for each cell.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from stillmap.core import se2, se3
 from stillmap.core.array_types import Float
-from stillmap.core.short_repr import ShortRepr
+from stillmap.core.local_frame import shift_poses
+from stillmap.core.profiling import Progress, no_progress
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.place import (
     Place,
     PlacedSession,
     Tie,
-    estimate_covariance,
+    combine_covariances,
     optimize_nodes,
     update_evidence,
 )
@@ -48,9 +49,7 @@ def lift_alignment(place: Place, session: Session, placement: Placement) -> Floa
     """
     if session.dimension == 2:
         return placement.T @ session.node_poses
-    T = np.eye(4)
-    T[:2, :2], T[:2, 3] = placement.T[:2, :2], placement.T[:2, 2]
-    nodes = T @ session.node_poses
+    nodes = embed_in_3d(placement.T) @ session.node_poses
     clearance = session.clearance[session.keyframes.nodes]
     at, rise = [np.zeros((0, 3))], [np.zeros(0)]
     for known in place.sessions:
@@ -78,12 +77,9 @@ def _tilt(at: Float, rise: Float) -> Float:
             np.column_stack([offset[kept], np.ones(int(kept.sum()))]), rise[kept], rcond=None
         )[0]
         slope, height = np.clip(fit[:2], -_MAX_TILT, _MAX_TILT), float(fit[2])
-    to_centre = np.eye(4)
-    to_centre[:3, 3] = centre
-    back = np.eye(4)
-    back[:3, 3] = -centre
     # a rotation vector (slope_y, -slope_x, 0) raises a point by its offset times the slope
     turn = se3.exp(np.array([0.0, 0.0, height, slope[1], -slope[0], 0.0]))
+    to_centre, back = (shift_poses(np.eye(4), by) for by in (centre, -centre))
     return np.asarray(to_centre @ turn @ back)
 
 
@@ -104,19 +100,6 @@ _MAX_UNEXPLAINED, _MAX_UNEXPLAINED_RATIO = 0.4, 0.6
 _MAP_STD = {2: (0.04, 0.04, 0.003), 3: (0.05, 0.05, 0.1, 0.01, 0.01, 0.004)}
 
 
-@dataclass(frozen=True, eq=False)
-class Growth(ShortRepr):
-    """Result of `add_session`.
-
-    Attributes:
-        place: with the session, or as it was.
-        refused: why the session is not in it; empty if it is.
-    """
-
-    place: Place
-    refused: str = ""
-
-
 def start_place(session: Session, resolution: float, voxel_size: float, threads: int) -> Place:
     """A place of one session, in its frame."""
     first = _place_session(session, session.node_poses)
@@ -130,8 +113,8 @@ def _place_session(session: Session, nodes: Float) -> PlacedSession:
 
 
 def add_session(
-    place: Place, session: Session, threads: int, report: Callable[[str], None] = lambda _: None
-) -> Growth:
+    place: Place, session: Session, threads: int, report: Progress = no_progress
+) -> tuple[Place, str]:
     """Add a session to a place, if the evidence is clear about where it lies.
 
     Args:
@@ -139,39 +122,42 @@ def add_session(
         session: of the same dimension.
         threads: the result does not depend on it.
         report: called with the step that begins.
+
+    Returns:
+        the place with the session, or as it was; and why the session is not in it, if it is not.
     """
-    report("aligning")
+    report("aligning", 0, 0, 0)
     placement = find_placement(place.sessions, session)
     if placement.refused and not placement.rivals:
-        return Growth(place, placement.refused)
+        return place, placement.refused
     start = placed = _place_session(session, lift_alignment(place, session, placement))
     matches, states = placement.matches, None
     if place.dimension == 3:
         matches = match_session(place, placed, PREDICTION_STD, None, threads)
         if placement.rivals and not _beats_rivals(place, session, placement, matches, threads):
-            return Growth(place, placement.refused)
+            return place, placement.refused
     for number in range(_EM_ROUNDS):
         if states is not None:
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
-        report("optimizing poses")
+        report("optimizing poses", 0, 0, 0)
         ties = make_ties(matches, len(place.sessions))
         if place.dimension == 3 or not placement.matches:
             ties.append(_tie_maps(place, start))
         elif len(ties) < _MIN_TIES:
-            return Growth(place, "too few of its keyframes can be registered to the place")
+            return place, "too few of its keyframes can be registered to the place"
         grown, agreeing = _optimize(place, placed, ties)  # M-step
         if agreeing < _MIN_AGREEING:
-            return Growth(place, "constraints to the place contradict each other")
+            return place, "constraints to the place contradict each other"
         placed = grown.sessions[-1]
         if number + 1 == _EM_ROUNDS:
             break
-        report("comparing sessions")
+        report("comparing sessions", 0, 0, 0)
         grown = update_evidence(grown, threads, _MAX_MOTION)
         states = estimate_planar(grown)  # E-step
         if place.dimension == 2 and (differ := _differing_share(grown)) > _MAX_DIFFERING:
             why = f"{100 * differ:.0f} % of the surfaces that both saw differ after optimization"
-            return Growth(place, f"it contradicts the place: {why}")
-    return Growth(_describe(update_evidence(grown, threads), ties))
+            return place, f"it contradicts the place: {why}"
+    return _describe(update_evidence(grown, threads), ties), ""
 
 
 def _differing_share(place: Place) -> float:
@@ -294,9 +280,10 @@ def _describe(place: Place, ties: list[Tie]) -> Place:
     """The place with covariance and overlap of its last session."""
     *before, placed = place.sessions
     planar = [each.require_evidence()[1] for each in place.sessions]
-    last = replace(
-        placed,
-        covariance=estimate_covariance(placed, ties),
-        overlap=measure_overlap(planar, len(before)),
-    )
+    nodes = placed.session.node_poses
+    # at its first scan and in its frame
+    own = (se2.inverse(nodes[0]) @ nodes)[[tie.second_node for tie in ties]]
+    covariance = combine_covariances(own, [tie.covariance for tie in ties])
+    overlap = measure_overlap(planar, len(before))
+    last = replace(placed, covariance=covariance, overlap=overlap)
     return replace(place, sessions=[*before, last])

@@ -4,7 +4,6 @@ import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,7 +13,7 @@ from stillmap.core.array_folder import write_arrays
 from stillmap.core.errors import InputError
 from stillmap.core.json import write_json
 from stillmap.core.parallel import resolve_threads
-from stillmap.core.profiling import Progress
+from stillmap.core.profiling import Progress, prefix_steps
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
@@ -143,16 +142,11 @@ def prepare_sessions(
     Raises:
         InputError: an input cannot be read or mapped.
     """
-    return [
-        _prepare_session(session, options, odometry, folder, partial(_report, progress, number))
-        for number, session in enumerate(inputs, start=1)
-    ]
-
-
-def _report(
-    progress: Progress, number: int, stage: str, iteration: int, done: int, total: int
-) -> None:
-    progress(f"session {number}: {stage}", iteration, done, total)
+    out = []
+    for number, session in enumerate(inputs, start=1):
+        report = prefix_steps(progress, f"session {number}")
+        out.append(_prepare_session(session, options, odometry, folder, report))
+    return out
 
 
 def _prepare_session(
@@ -165,8 +159,7 @@ def _prepare_session(
         return keep_session(session, given, given.deskewed, folder, options)
     with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
         if not isinstance(given, Result):
-            source = given[0] if isinstance(given, tuple) and len(given) == 1 else given
-            given = build(source, options, odometry=odometry, progress=report, scratch=scratch)
+            given = build(given, options, odometry=odometry, progress=report, scratch=scratch)
         mapped, recording = Path(scratch) / "result", given.recording
         given.save(mapped)
         del given

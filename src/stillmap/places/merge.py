@@ -6,9 +6,9 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,7 +16,7 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, remove
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
-from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.profiling import Progress, no_progress, prefix_steps
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.pipeline.options import Options, adopt_cells
@@ -27,7 +27,7 @@ from stillmap.places.keyframes import Session
 from stillmap.places.place import Place, update_evidence
 from stillmap.places.store import copy_session, read_place
 from stillmap.results.reader import RECORD, is_place
-from stillmap.results.result import Result, load, remove_with, report_to, to_options
+from stillmap.results.result import Result, load, report_to, to_options
 from stillmap.results.timeline import PlaceSession, read_sessions
 
 Paths: TypeAlias = Sequence[str | os.PathLike[str]]
@@ -75,6 +75,7 @@ def merge_sessions(
             sessions could be placed.
     """
     threads = resolve_threads(job.options.threads)
+    _require_apart(output, job)
     with atomic_folder(output, RECORD, overwrite) as folder:
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder, threads)
@@ -157,9 +158,8 @@ def _add_all(
             if session.dimension != place.dimension:
                 why = f"it is in {session.dimension}D, the place in {place.dimension}D"
             else:
-                report = partial(_report_step, progress, session.name)
-                growth = add_session(place, session, threads, report)
-                place, why = growth.place, growth.refused
+                report = prefix_steps(progress, session.name)
+                place, why = add_session(place, session, threads, report)
             if why:
                 refusals[session.name] = PlaceSession(session.name, session.input, False, why)
             else:
@@ -167,10 +167,6 @@ def _add_all(
                 refusals.pop(session.name, None)
                 grew = True
     return place, [refusals[session.name] for session in pending]
-
-
-def _report_step(progress: Progress, name: str, step: str) -> None:
-    progress(f"{name}: {step}", 0, 0, 0)
 
 
 def _reframe(place: Place, name: str) -> Place:
@@ -188,13 +184,11 @@ def _reframe(place: Place, name: str) -> Place:
 
 
 def _check_job(job: MergeJob, names: Sequence[str]) -> None:
-    """Refuse, before any work, too few sessions, and a frame or a state of the map of none.
+    """Refuse, before any work, one session alone, and a frame or a state of the map of none.
 
     Raises:
         InputError: it is such a job.
     """
-    if not job.sessions:
-        raise InputError("no session is named that is to be merged")
     if len(names) < 2:
         raise InputError("one session alone is no place", hint="merge it with others, or map it")
     if job.frame is not None and job.frame not in names:
@@ -244,30 +238,38 @@ def merge(
     """
     if isinstance(sessions, str | os.PathLike):
         raise TypeError("sessions: expected a list of sessions, got one path")
-    chosen, (base, others) = to_options(options), _split_base(sessions)
-    taken = [] if base is None else [known.name for known in read_sessions(base)]
-    job = MergeJob(base, list_sessions(others, taken), chosen, frame, map_state, odometry)
-    with report_to(progress, chosen.em.max_iterations) as report:
+    job = plan_merge(sessions, to_options(options), frame, map_state, odometry)
+    with report_to(progress, job.options.em.max_iterations) as report:
         if output is not None:
-            _require_apart(Path(output), job)
             merge_sessions(job, Path(output), overwrite, report)
             return load(Path(output))
         return _merge_temporarily(job, report)
 
 
-def _split_base(
+def plan_merge(
     sessions: Sequence[SessionLike],
-) -> tuple[Path | None, list[Paths | Recording | Result]]:
-    """The place that grows, if there is one, and the sessions."""
-    given = [
-        [session] if isinstance(session, str | os.PathLike) else session for session in sessions
-    ]
-    first = given[0] if given else None
+    options: Options,
+    frame: str | None,
+    map_state: str,
+    odometry: bool,
+) -> MergeJob:
+    """The job of `merge`.
+
+    Raises:
+        InputError: no session is named, or one cannot be read.
+    """
+    others = [[one] if isinstance(one, str | os.PathLike) else one for one in sessions]
+    first, base = others[0] if others else None, None
     if isinstance(first, Result) and first.path is not None and len(first.sessions) > 1:
-        return first.path, given[1:]
-    if isinstance(first, list) and len(first) == 1 and is_place(Path(first[0])):
-        return Path(first[0]), given[1:]
-    return None, given
+        base = first.path
+    elif isinstance(first, list) and len(first) == 1 and is_place(Path(first[0])):
+        base = Path(first[0])
+    others = others if base is None else others[1:]
+    if not others:
+        where = "" if base is None else str(base)
+        raise InputError("no session is named that is to be merged", where=where)
+    taken = [] if base is None else [known.name for known in read_sessions(base)]
+    return MergeJob(base, list_sessions(others, taken), options, frame, map_state, odometry)
 
 
 def _require_apart(output: Path, job: MergeJob) -> None:
@@ -291,5 +293,5 @@ def _merge_temporarily(job: MergeJob, report: Progress) -> Result:
     except BaseException:
         remove(home)
         raise
-    remove_with(place, home)
+    weakref.finalize(place, remove, home)  # when it is no longer used
     return place

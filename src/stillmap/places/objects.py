@@ -1,25 +1,22 @@
 """Moving objects of sessions in the frame of their place."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float
-from stillmap.core.errors import InputError
-from stillmap.core.input_files import copy_content, read_bytes
+from stillmap.core.input_files import copy_content
 from stillmap.core.json import read_json
-from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_ply, write_traffic
-from stillmap.results.point_cloud import coordinate_fields, ply_header
+from stillmap.io.point_cloud.ply import read_layout
+from stillmap.io.point_cloud.table import read_columns
+from stillmap.results import objects
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
 
-_OBJECTS, _LIST, _ORIGINAL = "objects", "objects.json", "objects"
+_OBJECTS, _LIST = "objects", "objects.json"
 _MAX_BYTES = 256 << 20
-_MAX_CLOUD = 1 << 30  # bytes
 
 
 def copy_objects(result: Path, state: Path) -> None:
@@ -30,7 +27,7 @@ def copy_objects(result: Path, state: Path) -> None:
     source = result / _OBJECTS
     if not (source / _LIST).is_file():
         return
-    target = state / _ORIGINAL
+    target = state / _OBJECTS
     target.mkdir()
     for path in sorted(source.iterdir()):
         if path.name == _LIST or path.suffix == ".ply":
@@ -56,8 +53,8 @@ def write_objects(folder: Path, transforms: Mapping[str, Float]) -> None:
             if cloud.is_file():
                 copy_content(cloud, joined / f"{number:04d}.ply")
             records.append({**record, "id": number, "session": name})
-    _write_records(joined / _LIST, records)
-    write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(joined / _LIST)))
+    objects.write_records(joined / _LIST, records)
+    objects.write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(joined / _LIST)))
 
 
 def _place_objects(home: Path, T: Float) -> list[dict[str, Any]]:
@@ -66,26 +63,21 @@ def _place_objects(home: Path, T: Float) -> list[dict[str, Any]]:
     Raises:
         InputError: what is kept of them is damaged.
     """
-    source, target = home / "state" / _ORIGINAL, home / _OBJECTS
+    source, target = home / "state" / _OBJECTS, home / _OBJECTS
     if not source.is_dir():
         return []
     target.mkdir()
     # read_tracks checks them
     kept = read_json(source / _LIST, _MAX_BYTES) if read_tracks(source / _LIST) else []
     records = [_transform_record(record, T) for record in kept]
-    _write_records(target / _LIST, records)
-    D = T.shape[-1] - 1
+    objects.write_records(target / _LIST, records)
+    D, names = T.shape[-1] - 1, [name for name, _ in objects.OBJECT_FIELDS]
     for path in sorted(source.glob("*.ply")):
-        vertices = _read_cloud(path)
-        points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
-        moved = T[:D, :D] @ points + T[:D, D:]
-        write_ply(target / path.name, moved.T, vertices["seconds"], vertices["p_dynamic"])
+        blocks = read_columns(read_layout(path), names)
+        rows = np.hstack([np.zeros((len(names), 0)), *blocks])
+        moved = T[:D, :D] @ rows[:D] + T[:D, D:]
+        objects.write_ply(target / path.name, moved.T, *rows[3:])
     return records
-
-
-def _write_records(path: Path, records: list[dict[str, Any]]) -> None:
-    lines = ",\n".join(json.dumps(record, allow_nan=False) for record in records)
-    path.write_text(f"[\n{lines}\n]\n" if records else "[]\n", encoding="utf-8")
 
 
 def _transform_record(record: dict[str, Any], T: Float) -> dict[str, Any]:
@@ -99,21 +91,5 @@ def _transform_record(record: dict[str, Any], T: Float) -> dict[str, Any]:
     velocity[:2] = [track["vx"], track["vy"]]
     turned = T[:D, :D] @ velocity
     columns = [*zip(names, moved, strict=True), ("vx", turned[0]), ("vy", turned[1])]
-    changed = {name: np.round(values, MILLIMETRES).tolist() for name, values in columns}
+    changed = {name: np.round(values, objects.MILLIMETRES).tolist() for name, values in columns}
     return {**record, "track": {**track, **changed}}
-
-
-def _read_cloud(path: Path) -> NDArray[np.void]:
-    """The points of an object.
-
-    Raises:
-        InputError: they are not as they were written.
-    """
-    content = read_bytes(path, _MAX_CLOUD)
-    end = content.find(b"end_header\n") + len(b"end_header\n")
-    for is_far in (False, True):
-        fields = coordinate_fields(OBJECT_FIELDS, is_far)
-        count, rest = divmod(len(content) - end, np.dtype(fields).itemsize)
-        if not rest and content[:end] == ply_header(fields, count):
-            return np.frombuffer(content, fields, offset=end)
-    raise InputError("is no cloud of an object as stillmap writes it", where=str(path))

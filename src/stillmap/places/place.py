@@ -85,17 +85,6 @@ def optimize_nodes(
     return np.split(poses, ends[:-1]), agree
 
 
-def place_scans(session: Session, T: Float, nodes: Float) -> Float:
-    """(T, D+1, D+1) poses of all scans of a session in the place.
-
-    Args:
-        session: T scans.
-        T: (D+1, D+1) T_place_session, about.
-        nodes: (N, D+1, D+1) poses of its nodes in the place.
-    """
-    return propagate_corrections(T @ session.poses, session.graph.keyframes, nodes)
-
-
 def fit_alignment(session_poses: Float, place_poses: Float) -> Float:
     """(D+1, D+1) T_place_session that maps poses (N, D+1, D+1) of a session best to those in the
     place, in the sense of least squares of positions and of the ends of their axes."""
@@ -105,14 +94,7 @@ def fit_alignment(session_poses: Float, place_poses: Float) -> Float:
         np.swapaxes(T[:, :D, :D] @ tips + T[:, :D, D:], 1, 2).reshape(-1, D)
         for T in (session_poses, place_poses)
     )
-    centre, their_centre = ours.mean(axis=0), theirs.mean(axis=0)
-    U, _, V = np.linalg.svd((theirs - their_centre).T @ (ours - centre))
-    sign = np.ones(D)
-    sign[-1] = np.sign(np.linalg.det(U @ V))
-    T = np.eye(D + 1)
-    T[:D, :D] = U @ np.diag(sign) @ V
-    T[:D, D] = their_centre - T[:D, :D] @ centre
-    return T
+    return se2.align_points(ours, theirs)
 
 
 # of a cell, by which keyframes may move before the evidence of their session is measured again
@@ -147,8 +129,8 @@ class PlacedSession(ShortRepr):
     @cached_property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_place_base of all scans."""
-        T = fit_alignment(self.session.node_poses, self.nodes)
-        return place_scans(self.session, T, self.nodes)
+        about = fit_alignment(self.session.node_poses, self.nodes) @ self.session.poses
+        return propagate_corrections(about, self.session.graph.keyframes, self.nodes)
 
     @property
     def keyframe_poses(self) -> Float:
@@ -242,19 +224,11 @@ def _measure(placed: PlacedSession, place: Place, limit: float, threads: int) ->
     return replace(placed, evidence=(evidence, planar), measured_at=poses)
 
 
-def estimate_covariance(placed: PlacedSession, ties: Sequence[Tie]) -> Float:
-    """Covariance of the alignment of a session, at its first scan and in its frame.
+def combine_covariances(poses: Float, covariances: Sequence[Float]) -> Float:
+    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance.
 
     (3, 3) of x, y, heading; (6, 6) of translation and rotation vector in 3D.
     """
-    poses = se2.inverse(placed.session.node_poses[0]) @ placed.session.node_poses
-    return combine_covariances(
-        poses[[tie.second_node for tie in ties]], [tie.covariance for tie in ties]
-    )
-
-
-def combine_covariances(poses: Float, covariances: Sequence[Float]) -> Float:
-    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance."""
     D = poses.shape[-1] - 1
     information: Float = 1e-9 * np.eye(3 * (D - 1))
     for pose, covariance in zip(poses, covariances, strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.array_types import Bool, Float, Float32, Index
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import bound_box
 from stillmap.core.tiles import TILE, TiledArray, compact, crop
@@ -17,6 +17,7 @@ from stillmap.em import OccupancyMap
 from stillmap.places.changes import PlaceChange
 from stillmap.places.evidence import BeamCells, Evidence, to_sums
 from stillmap.places.place_states import MIN_HITS, PlaceStates, Tile, are_near, iter_tiles
+from stillmap.results.timeline import last_observed
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -73,7 +74,7 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
         share = (observed * occupied).sum(axis=1) / np.maximum(observed.sum(axis=1), 1)
         p_shown = (share > 0.5).astype(np.float64)
     else:
-        p_shown = occupied[np.arange(len(occupied)), _last_observed(observed, limit)]
+        p_shown = occupied[np.arange(len(occupied)), last_observed(observed, limit)]
     unchanged = states.p_changing <= 0.5
     p_shown = np.where(unchanged, np.maximum(p_shown, states.p_static), p_shown)
     stands, gone = _settle_unlisted(place, changes)
@@ -83,14 +84,6 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
         states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
     )
     return ShownState(place, p_shown, support.astype(np.float32), np.concatenate([stands, gone]))
-
-
-def _last_observed(observed: Bool, limit: int) -> Index:
-    """(K,) the last session up to `limit` that observed each cell, else the first one after."""
-    before = observed[:, : limit + 1]
-    last = limit - np.argmax(before[:, ::-1], axis=1)
-    first_after = np.argmax(observed, axis=1)
-    return np.asarray(np.where(before.any(axis=1), last, first_after), np.intp)
 
 
 def _settle_unlisted(place: PlaceStates, changes: list[PlaceChange]) -> tuple[Index, Index]:

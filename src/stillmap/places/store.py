@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from stillmap.core import arrays
 from stillmap.core.array_folder import parse, read_array, read_npz, read_poses, write_arrays
-from stillmap.core.array_types import Float, Int64
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content
@@ -27,7 +27,7 @@ from stillmap.places.place import Place, PlacedSession, Tie
 from stillmap.results.folder import ResultFolder
 from stillmap.results.near_result import MAX_DISTANCE
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
-from stillmap.results.reader import RECORD, SESSIONS, read_labels, read_run, read_tracks
+from stillmap.results.reader import RECORD, SESSIONS, read_beams, read_labels, read_run, read_tracks
 from stillmap.results.timeline import HINT, PlaceSession, read_sessions
 from stillmap.slam import PoseGraph
 
@@ -71,11 +71,6 @@ def write_session(
     write_g2o(state / _GRAPH, graph, poses)
     stillmap_folder.write_into(keyframes.recording, folder)
     write_arrays(folder, {"scans": keyframes.scans.astype(np.int64), "e": keyframes.e})
-
-
-def write_placement(home: Path, placed: PlacedSession) -> None:
-    """Write where a session lies in its place, and where its evidence was measured."""
-    write_arrays(home / STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
 
 
 def write_ties(path: Path, ties: Sequence[Tie], D: int) -> None:
@@ -172,7 +167,10 @@ def read_session(home: Path, path: str | None, threads: int = 1) -> Session:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
     state, folder = home / STATE, home / STATE / _KEYFRAMES
-    stamp_ns, recording = _read_stamps(home / "beams"), read_recording(folder)
+    stamp_ns, recording = np.array(read_beams(home)[0]), read_recording(folder)
+    # compared, not subtracted: differences of numbers from a file may overflow
+    if not len(stamp_ns) or (stamp_ns[1:] < stamp_ns[:-1]).any():
+        raise _inconsistent(home / "beams")
     K, D, T = recording.n_scans, recording.dimension, len(stamp_ns)
     scans = np.array(read_array(folder / "scans.npy", (K,), np.int64), np.intp)
     e = read_array(folder / "e.npy", (recording.n_beams,), np.float32)
@@ -192,18 +190,6 @@ def read_session(home: Path, path: str | None, threads: int = 1) -> Session:
     output, origin = run.output_options, run.read_origin(SESSION_ORIGIN)
     band = output.min_obstacle_height, output.max_obstacle_height
     return Session(home.name, path, stamp_ns, poses, graph, keyframes, band, origin, threads)
-
-
-def _read_stamps(folder: Path) -> Int64:
-    """(T,) stamps of the scans of a session."""
-    stamp_ns = np.array(read_array(folder / "stamp_ns.npy", (None,), np.int64))
-    offset = np.array(read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64))
-    # compared, not subtracted: differences of numbers from a file may overflow
-    rises = all((column[1:] >= column[:-1]).all() for column in (offset, stamp_ns))
-    if not len(stamp_ns) or offset[0] != 0 or not rises:
-        raise _inconsistent(folder)
-    read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
-    return stamp_ns
 
 
 def read_beam_cells(home: Path, session: Session, resolution: float) -> BeamCells:

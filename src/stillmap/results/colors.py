@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float, Float32, Index
+
 Colors = NDArray[np.uint8]
 
 Rgb = tuple[int, int, int]
@@ -33,22 +35,19 @@ KIND_COLORS = {
 _HUE_STEP = 0.618034  # of the circle, from one id to the next, so that neighbors differ
 
 
-def color_by_p_static(p_static: NDArray[np.float32]) -> Colors:
+def color_by_p_static(p_static: Float32) -> Colors:
     """Orange (dynamic) over grey to blue (static) for P(static) (n,)."""
     return _interpolate_colors(_P_STATIC_COLORS, np.asarray(p_static, np.float64))
 
 
-def color_by_height(z: NDArray[np.floating], low: float, high: float) -> Colors:
-    """Dark blue at `low` to yellow at `high`, for heights z (n,) in m."""
-    return _shade(HEIGHT_COLORS, z, low, high)
+def color_by_height(
+    z: NDArray[np.floating], low: float, high: float, stops: Sequence[Rgb] = HEIGHT_COLORS
+) -> Colors:
+    """The first color at `low` to the last one at `high`, for heights z (n,) in m."""
+    return _interpolate_colors(stops, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
 
 
-def color_static(z: NDArray[np.floating], low: float, high: float) -> Colors:
-    """Dark grey at `low` to light grey at `high`, for heights z (n,) in m."""
-    return _shade(STATIC_COLORS, z, low, high)
-
-
-def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
+def color_by_id(number: Index | Sequence[int]) -> Colors:
     """A color for each id (n,)."""
     hue = np.mod(np.asarray(number, np.float64) * _HUE_STEP + 0.05, 1.0)
     # a cosine per channel, a third of the circle apart
@@ -56,13 +55,9 @@ def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
     return np.rint(120.0 + 105.0 * level).astype(np.uint8)
 
 
-def _shade(stops: Sequence[Rgb], z: NDArray[np.floating], low: float, high: float) -> Colors:
-    return _interpolate_colors(stops, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
-
-
-def _interpolate_colors(stops: Sequence[Rgb], share: NDArray[np.float64]) -> Colors:
+def _interpolate_colors(stops: Sequence[Rgb], share: Float) -> Colors:
     """Linear interpolation between evenly spaced colors over 0 to 1."""
     at = np.linspace(0.0, 1.0, len(stops))
     columns = [np.interp(share, at, column) for column in np.array(stops, np.float64).T]
-    colors: NDArray[np.float64] = np.stack(columns, axis=-1)
+    colors: Float = np.stack(columns, axis=-1)
     return np.rint(colors).astype(np.uint8)

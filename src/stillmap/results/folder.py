@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, config
 from stillmap.core.array_folder import parse
+from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
-from stillmap.core.grid_map import Region
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
@@ -22,7 +21,7 @@ from stillmap.io.trajectory import MAX_TRANSLATION, poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
 from stillmap.pipeline.options import Options, OutputOptions
 from stillmap.prepare.options import ReadOptions
-from stillmap.results.reader import LOCAL_ORIGIN, RECORD, Labels, is_result, read_labels, read_run
+from stillmap.results.reader import LOCAL_ORIGIN, RECORD, Labels, read_labels, read_run
 from stillmap.results.run_json import read_calibration
 from stillmap.slam import SlamOptions
 
@@ -93,7 +92,7 @@ class ResultFolder(ShortRepr):
             raise InputError("names no options", where=str(self.path))
         return self._resolve({"read": noted["read"]}).read
 
-    def read_origin(self, name: str = LOCAL_ORIGIN) -> NDArray[np.float64]:
+    def read_origin(self, name: str = LOCAL_ORIGIN) -> Float:
         """(3,) m, an entry of the record: by default the origin of the frame in which it was
         computed; zero without the entry.
 
@@ -155,7 +154,7 @@ class ResultFolder(ShortRepr):
         mapped = match_labels(recording, labels, str(source))
         return recording if left_out else mapped, labels
 
-    def read_poses(self, recording: Recording) -> NDArray[np.float64]:
+    def read_poses(self, recording: Recording) -> Float:
         """The estimated poses (T, D+1, D+1) T_map_base of a recording that was read by `read`.
 
         Raises:
@@ -228,17 +227,6 @@ def open_result(
             hint = "name it with recording=PATH"
             raise InputError("names no recording", where=str(result / RECORD), hint=hint)
     return ResultFolder(result, record, tuple(map(Path, paths)), bool(recording))
-
-
-def read_region(result: Path) -> Region | None:
-    """The part of the map frame that a result shows; None: everything, or the record is missing.
-
-    Raises:
-        InputError: the record is damaged.
-    """
-    if not is_result(result):
-        return None
-    return ResultFolder(result, read_run(result)).output_options.region
 
 
 def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float, Index
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import read_bytes
 from stillmap.mesh.texture import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
 
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071  # of glTF samplers
 _VERTICES, _INDICES = 34962, 34963  # targets of glTF buffer views
@@ -76,9 +75,7 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
         work.write_bytes(content)
 
 
-def _split_pages(
-    mesh: TexturedMesh | Mesh,
-) -> list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]:
+def _split_pages(mesh: TexturedMesh | Mesh) -> list[tuple[int, Index, Index]]:
     """By texture page, the gray one (-1) last: indices of the vertices, and faces of these."""
     if not len(mesh):
         raise ValueError("a mesh without faces")
@@ -143,9 +140,7 @@ def _finish(tree: dict[str, Any]) -> None:
 
 
 # from a model's frame, y up, to the map frame, z up
-MAP_FROM_GLTF: NDArray[np.float64] = np.array(
-    [[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
-)
+MAP_FROM_GLTF: Float = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 _HEAD = struct.Struct("<4sII")  # magic, version, length of all
 

@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float32
 from stillmap.core.arrays import write_npz
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import Layer, TiledArray, compact, rows_of
@@ -29,7 +30,7 @@ _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
 _IN_BETWEEN_FROM, _FREE_FROM = 90, 206
 
 
-def trinary_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
+def trinary_pixels(p_occupied: Float32) -> NDArray[np.uint8]:
     """(H, W) uint8: 0 where p > 0.65, 254 where p < 0.196, 205 between and where p is NaN."""
     pixels = np.full(p_occupied.shape, _UNKNOWN, np.uint8)
     pixels[p_occupied > OCCUPIED_THRESH] = _OCCUPIED
@@ -37,7 +38,7 @@ def trinary_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
     return pixels
 
 
-def scale_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
+def scale_pixels(p_occupied: Float32) -> NDArray[np.uint8]:
     """(H, W, 2) uint8 grey and alpha: grey 255 (1 - p), transparent where p is NaN.
 
     Rounding to a grey level never moves a cell across a threshold, so that a reader finds the
@@ -52,7 +53,7 @@ def scale_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.stack([np.clip(grey, low, high), alpha], axis=-1).astype(np.uint8)
 
 
-def raw_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
+def raw_pixels(p_occupied: Float32) -> NDArray[np.uint8]:
     """(H, W) uint8: occupancy in percent, 255 where p is NaN."""
     known = ~np.isnan(p_occupied)
     return np.where(known, np.rint(100 * np.where(known, p_occupied, 0)), 255).astype(np.uint8)
@@ -71,10 +72,10 @@ def write_map_server(folder: Path, occupancy: GridMap, mode: MapMode = "trinary"
         write_png(scale_pixels(np.asarray(p_occupied)[::-1]), folder / name, compress_level=6)
     else:
         _write_pgm(folder / name, p_occupied, trinary_pixels if mode == "trinary" else raw_pixels)
-    _write_yaml(folder / "map.yaml", name, mode, occupancy, (FREE_THRESH, OCCUPIED_THRESH))
+    _write_yaml(folder / "map.yaml", name, mode, occupancy)
 
 
-def write_keepout_mask(folder: Path, keepout: NDArray[np.bool_], occupancy: GridMap) -> None:
+def write_keepout_mask(folder: Path, keepout: Bool, occupancy: GridMap) -> None:
     """Write `keepout.pgm` and `keepout.yaml`, a mask for nav2's KeepoutFilter.
 
     A map server reads 100 where `keepout` (H, W) is true. Elsewhere it reads 0 where the map knows
@@ -83,8 +84,7 @@ def write_keepout_mask(folder: Path, keepout: NDArray[np.bool_], occupancy: Grid
     known = ~np.isnan(np.asarray(occupancy.p_occupied))
     pixels = np.where(keepout, _OCCUPIED, np.where(known, _FREE, _UNKNOWN)).astype(np.uint8)
     _write_pgm(folder / "keepout.pgm", pixels, np.asarray)
-    thresholds = FREE_THRESH, OCCUPIED_THRESH
-    _write_yaml(folder / "keepout.yaml", "keepout.pgm", "trinary", occupancy, thresholds)
+    _write_yaml(folder / "keepout.yaml", "keepout.pgm", "trinary", occupancy)
 
 
 def write_speed_mask(folder: Path, values: NDArray[np.uint8], occupancy: GridMap) -> None:
@@ -99,7 +99,11 @@ def write_speed_mask(folder: Path, values: NDArray[np.uint8], occupancy: GridMap
 
 
 def _write_yaml(
-    path: Path, image: str, mode: MapMode, occupancy: GridMap, thresholds: tuple[float, float]
+    path: Path,
+    image: str,
+    mode: MapMode,
+    occupancy: GridMap,
+    thresholds: tuple[float, float] = (FREE_THRESH, OCCUPIED_THRESH),
 ) -> None:
     """Write the description of an image of a map; thresholds: of free and of occupied cells."""
     free, occupied = thresholds

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.recording import Recording
@@ -19,31 +20,12 @@ from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.prepare.beam_times import add_beam_times
+from stillmap.results import reader, timeline
 from stillmap.results.folder import ResultFolder, match_labels, open_result
-from stillmap.results.reader import (
-    SESSIONS,
-    TILTING,
-    Labels,
-    Track,
-    is_place,
-    read_colors,
-    read_grid,
-    read_labels,
-    read_run,
-    read_tracks,
-)
 from stillmap.results.run_json import run_record
-from stillmap.results.timeline import (
-    PlaceSession,
-    SessionChange,
-    read_changes,
-    read_sessions,
-    read_states,
-)
 from stillmap.slam import deskew_recording
 from stillmap.tracking import MovingObject
 
-Float = NDArray[np.float64]
 PathLike: TypeAlias = str | os.PathLike[str]
 Source: TypeAlias = Recording | PathLike | Sequence[PathLike]
 
@@ -54,12 +36,12 @@ class MappedPlace:
 
     map: GridMap
     poses: Float
-    stamp_ns: NDArray[np.int64]
-    p_static: NDArray[np.float32]
-    hit: NDArray[np.bool_]
-    objects: Sequence[MovingObject | Track]
-    sessions: list[PlaceSession]
-    changes: list[SessionChange]
+    stamp_ns: Int64
+    p_static: Float32
+    hit: Bool
+    objects: Sequence[MovingObject | reader.Track]
+    sessions: list[timeline.PlaceSession]
+    changes: list[timeline.SessionChange]
     mapping: MappingResult | None = None
     folder: ResultFolder | None = None
     source: Recording | str | Sequence[PathLike] | None = None
@@ -91,24 +73,24 @@ class MappedPlace:
     @classmethod
     def open(cls, path: PathLike, recording: Source | None = None) -> Self:
         """See `stillmap.load`."""
-        folder, has_several = Path(path), is_place(Path(path))
+        folder, has_several = Path(path), reader.is_place(Path(path))
         if has_several and recording is not None:
             hint = "load_session(NAME, recording=PATH) says where that of one session is"
             raise InputError("is a place of several recordings", where=str(path), hint=hint)
-        record, labels = read_run(folder), read_labels(folder)
+        record, labels = reader.read_run(folder), reader.read_labels(folder)
         opened = ResultFolder(folder, record, source_given=recording is not None)
-        poses, changes = _read_poses(opened, labels), list[SessionChange]()
+        poses, changes = _read_poses(opened, labels), list[timeline.SessionChange]()
         sessions = [_only_session(record["input"].get("path"), labels.stamp_ns, poses)]
         if has_several:
-            sessions = read_sessions(folder)
-            changes = read_changes(folder, read_states(folder)[1])
+            sessions = timeline.read_sessions(folder)
+            changes = timeline.read_changes(folder, timeline.read_states(folder)[1])
         result = cls(
-            map=read_grid(folder),
+            map=reader.read_grid(folder),
             poses=poses,
             stamp_ns=labels.stamp_ns,
             p_static=labels.p_static,
             hit=labels.hit,
-            objects=read_tracks(folder / "objects" / "objects.json"),
+            objects=reader.read_tracks(folder / "objects" / "objects.json"),
             sessions=sessions,
             changes=changes,
             folder=opened,
@@ -117,7 +99,7 @@ class MappedPlace:
         ends = [0, *(scans.stop for scans in result.stretches)]
         if [scans.start for scans in result.stretches] != ends[:-1] or ends[-1] != len(poses):
             what = "is damaged: its scans are not those of the place"
-            raise InputError(what, where=str(folder / SESSIONS))
+            raise InputError(what, where=str(folder / reader.SESSIONS))
         return result
 
     @property
@@ -167,7 +149,7 @@ class MappedPlace:
             hint = "load_session(NAME).recording is that of one session"
             raise InputError("is a place of several recordings", where=str(self.path), hint=hint)
         if isinstance(self.source, Recording):
-            mapped = match_labels(self.source, read_labels(folder.folder), "recording")
+            mapped = match_labels(self.source, reader.read_labels(folder.folder), "recording")
             # read from a file, it would have them already
             recording = add_beam_times(mapped, folder.read_options.spin)
         else:
@@ -187,7 +169,8 @@ class MappedPlace:
     @cached_property
     def colors(self) -> NDArray[np.uint8] | None:
         """(M, 3) of the end points of one that was opened; None: without."""
-        return read_colors(self.loaded.folder, len(self.hit)) if self.poses.shape[-1] == 4 else None
+        is_3d = self.poses.shape[-1] == 4
+        return reader.read_colors(self.loaded.folder, len(self.hit)) if is_3d else None
 
     @property
     def loaded(self) -> ResultFolder:
@@ -202,20 +185,14 @@ class MappedPlace:
         return sorted(placed, key=lambda scans: int(scans.start))
 
 
-def _only_session(noted: Any, stamp_ns: NDArray[np.int64], poses: Float) -> PlaceSession:
+def _only_session(noted: Any, stamp_ns: Int64, poses: Float) -> timeline.PlaceSession:
     """The session of a result of one recording, whose frame is the map frame."""
     D, path = poses.shape[-1] - 1, noted if isinstance(noted, str) and noted else None
     times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
-    return PlaceSession(
-        input_stem(Path(path)) if path else "session",
-        path,
-        True,
-        T_place_session=np.eye(D + 1),
-        covariance=np.zeros((3 * (D - 1), 3 * (D - 1))),
-        scans=slice(0, len(stamp_ns)),
-        first_ns=times[0],
-        last_ns=times[1],
-    )
+    name, dof = input_stem(Path(path)) if path else "session", 3 * (D - 1)
+    frame = np.eye(D + 1), np.zeros((dof, dof))
+    scans = slice(0, len(stamp_ns))
+    return timeline.PlaceSession(name, path, True, "", *frame, 1.0, scans, *times)
 
 
 def input_stem(path: Path) -> str:
@@ -224,7 +201,7 @@ def input_stem(path: Path) -> str:
     return name.split(".")[0] or name
 
 
-def _read_poses(opened: ResultFolder, labels: Labels) -> Float:
+def _read_poses(opened: ResultFolder, labels: reader.Labels) -> Float:
     """(T, D+1, D+1) T_map_base."""
     path = opened.folder / "trajectory.tum"
     stamp_ns, poses = read_tum(path)
@@ -232,5 +209,5 @@ def _read_poses(opened: ResultFolder, labels: Labels) -> Float:
         what = f"has {len(stamp_ns)} poses, not one for each of {len(labels.stamp_ns)} scans"
         raise InputError(what, where=str(path))
     # a rig with a tilting laser writes clouds, but its map is that of the planar one
-    is_3d = opened.dimension == 3 and not (opened.folder / TILTING).is_dir()
+    is_3d = opened.dimension == 3 and not (opened.folder / reader.TILTING).is_dir()
     return poses if is_3d else se2.project_to_plane(poses)

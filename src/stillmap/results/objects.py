@@ -1,24 +1,25 @@
 """`objects/`: tracked objects as JSON and point clouds; `traffic.npz`; poses along tracks."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core import se2
+from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.arrays import write_npz
 from stillmap.core.local_frame import FAR
+from stillmap.io.point_cloud.ply import make_header
+from stillmap.io.point_cloud.table import Fields
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.point_cloud import Fields, coordinate_fields, ply_header
+from stillmap.pipeline.tilting import TiltingResult
+from stillmap.results.point_cloud import coordinate_fields
 from stillmap.results.reader import Track
 from stillmap.tracking import FlowMap, MovingObject
 
-if TYPE_CHECKING:
-    from stillmap.pipeline.tilting import TiltingResult
-
-Float = NDArray[np.float64]
 Mover = MovingObject | Track
 
 _MIN_SPEED = 0.2  # m/s from which a velocity gives the heading
@@ -27,22 +28,23 @@ OBJECT_FIELDS: Fields = [(name, "<f4") for name in ("x", "y", "z", "seconds", "p
 MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
-def write_objects(folder: Path, result: "MappingResult | TiltingResult") -> None:
+def write_objects(folder: Path, result: MappingResult | TiltingResult) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
     objects, recording, p_static = result.objects, result.deskewed, result.p_static
     folder.mkdir()
-    with (folder / "objects.json").open("w", encoding="utf-8", newline="\n") as file:
-        file.write("[")
-        for number, one in enumerate(objects):  # one object a line
-            file.write(",\n" if number else "\n")
-            file.write(json.dumps(object_record(one), allow_nan=False))
-        file.write("\n]\n" if objects else "]\n")
+    write_records(folder / "objects.json", map(object_record, objects))
     for one in objects:
         ends = recording.end_points(one.beams, result.poses)
         stamps = recording.stamp_ns[recording.scans_of(one.beams)]
         seconds = 1e-9 * (stamps - one.stamp_ns[0])
         write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - p_static[one.beams])
         recording.release_pages(p_static, one.beams)
+
+
+def write_records(path: Path, records: Iterable[dict[str, Any]]) -> None:
+    """Write a list of objects as JSON, one a line."""
+    lines = ",\n".join(json.dumps(record, allow_nan=False) for record in records)
+    path.write_text(f"[\n{lines}\n]\n" if lines else "[]\n", encoding="utf-8")
 
 
 def object_record(one: MovingObject) -> dict[str, Any]:
@@ -66,12 +68,7 @@ def object_record(one: MovingObject) -> dict[str, Any]:
     }
 
 
-def write_ply(
-    path: Path,
-    ends: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    p_dynamic: NDArray[np.float32],
-) -> None:
+def write_ply(path: Path, ends: Float, seconds: Float, p_dynamic: Float32) -> None:
     """Points (n, D) of an object, when each was seen, and how probably it is dynamic; 2D: z = 0.
     Coordinates far from the origin have 64 bits."""
     fields = coordinate_fields(OBJECT_FIELDS, bool(np.abs(ends).max(initial=0.0) > FAR))
@@ -79,7 +76,7 @@ def write_ply(
     for name, column in zip("xyz", ends.T, strict=False):
         vertices[name] = column
     vertices["seconds"], vertices["p_dynamic"] = seconds, p_dynamic
-    path.write_bytes(ply_header(fields, len(ends)) + vertices.tobytes())
+    path.write_bytes(make_header(fields, len(ends)) + vertices.tobytes())
 
 
 def write_traffic(path: Path, traffic: FlowMap) -> None:
@@ -109,15 +106,12 @@ def interpolate_pose(track: Mover, stamp_ns: int) -> Float:
     # differences first: stamps in ns exceed the precision of float64
     seconds = 1e-9 * (track.stamp_ns - stamp_ns)
     x, y, angle = (np.interp(0.0, seconds, row) for row in (*track.xy.T, headings(track.velocity)))
-    T = np.eye(4)
-    T[0, :2], T[1, :2] = (np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))
-    T[:3, 3] = x, y, 0.0 if track.z is None else np.interp(0.0, seconds, track.z)
+    T = embed_in_3d(se2.matrix(x, y, angle))
+    T[2, 3] = 0.0 if track.z is None else np.interp(0.0, seconds, track.z)
     return T
 
 
-def iter_present_tracks(
-    tracks: Sequence[Mover], stamp_ns: NDArray[np.int64]
-) -> Iterator[list[int]]:
+def iter_present_tracks(tracks: Sequence[Mover], stamp_ns: Int64) -> Iterator[list[int]]:
     """For each of the rising stamps (T,), the indices of the tracks that span it."""
     first = np.searchsorted(stamp_ns, np.array([one.stamp_ns[0] for one in tracks], np.int64))
     last = np.array([one.stamp_ns[-1] for one in tracks], np.int64)

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from stillmap.core.array_types import Float
 from stillmap.core.errors import import_extra
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.results.colors import KIND_COLORS
@@ -100,6 +100,6 @@ def _draw_preview(result: MappedPlace) -> Image.Image:
     return image.quantize(64)
 
 
-def _track(result: MappedPlace) -> NDArray[np.float64]:
+def _track(result: MappedPlace) -> Float:
     """(T, 2) positions of the robot in metres."""
     return result.poses[:, :2, -1]

@@ -10,23 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import FAR
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.table import TableLayout, read_columns
+from stillmap.io.point_cloud.table import Fields, TableLayout, read_columns
 from stillmap.io.trajectory import MAX_TRANSLATION
 
 Part = Literal["static", "dynamic"]
 
-Fields = list[tuple[str, str]]  # names and types
-
 FIELDS: Fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 COLOURS: Fields = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 PACKED_COLOUR: Fields = [("rgb", "<u4")]  # 0x00RRGGBB, of PCD
-_TYPES = {"<f4": "float", "<f8": "double", "u1": "uchar"}
 MAX_BLOCK = 1 << 16  # points in memory
 
 
@@ -40,9 +38,9 @@ class Block(NamedTuple):
         colors: (n, 3) uint8; None for a cloud without colors.
     """
 
-    points: NDArray[np.float64]
-    p_static: NDArray[np.float32]
-    stamp_ns: NDArray[np.int64] | None
+    points: Float
+    p_static: Float32
+    stamp_ns: Int64 | None
     colors: NDArray[np.uint8] | None = None
 
 
@@ -59,7 +57,7 @@ class Cloud:
     """
 
     count: int
-    origin: NDArray[np.float64]
+    origin: Float
     start_ns: int | None
     make_blocks: Callable[[], Iterator[Block]]
     has_colors: bool = False
@@ -101,11 +99,11 @@ class Cloud:
 def cloud_from_recording(
     recording: Recording,
     deskewed: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
+    poses: Float,
+    p_static: Float32,
     only: Part | None = None,
     colors: NDArray[np.uint8] | None = None,
-    origin: NDArray[np.float64] | None = None,
+    origin: Float | None = None,
 ) -> Cloud:
     """All returns, in the order of the recording; memory is that of a few scans.
 
@@ -119,11 +117,7 @@ def cloud_from_recording(
         origin: (3,) of the frame in which the result was computed; None or zero: that of the map.
     """
     times = recording.beam_time
-    earliest = 0.0
-    if times is not None:
-        for block in arrays.iter_blocks(times):
-            earliest = min(earliest, float(times[block].min()))
-    T_map_sensor = deskewed.T_map_sensor(poses)
+    T_map_sensor, earliest = deskewed.T_map_sensor(poses), min(recording.beam_time_span[0], 0.0)
     if origin is None or not origin.any():
         origin = np.round(poses[0, :3, 3])
 
@@ -136,16 +130,12 @@ def cloud_from_recording(
             selected = None if colors is None else np.asarray(colors[chunk.beams][hits])
             yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns, selected)
 
-    return Cloud(
-        count=sum(
-            int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
-            for block in arrays.iter_blocks(deskewed.hit, p_static)
-        ),
-        origin=origin,
-        start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
-        make_blocks=make_blocks,
-        has_colors=colors is not None,
+    count = sum(
+        int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
+        for block in arrays.iter_blocks(deskewed.hit, p_static)
     )
+    start_ns = int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest))
+    return Cloud(count, origin, start_ns, make_blocks, colors is not None)
 
 
 def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
@@ -180,7 +170,7 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
     return Cloud(count, _find_origin(layouts), None, make_blocks, has_colors)
 
 
-def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
+def _find_origin(layouts: Sequence[TableLayout]) -> Float:
     """(3,) whole m near the points of files; zero where they are 32-bit, and so near it."""
     for layout in layouts:
         dtype = layout.dtype
@@ -192,21 +182,14 @@ def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
     return np.zeros(3)
 
 
-def _select(
-    hit: NDArray[np.bool_], p_static: NDArray[np.float32], only: Part | None
-) -> NDArray[np.bool_]:
+def _select(hit: Bool, p_static: Float32, only: Part | None) -> Bool:
     if only is None:
         return np.asarray(hit)
     dynamic = p_static < DYNAMIC_BELOW
     return np.asarray(hit & (dynamic if only == "dynamic" else ~dynamic))
 
 
-def _to_map_frame(
-    deskewed: Recording,
-    chunk: Chunk,
-    selected: NDArray[np.bool_],
-    T_map_sensor: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _to_map_frame(deskewed: Recording, chunk: Chunk, selected: Bool, T_map_sensor: Float) -> Float:
     """Selected end points of a chunk, (n, 3) m in the map frame."""
     out = np.empty((int(np.count_nonzero(selected)), 3))
     done, points = 0, deskewed.points[chunk.beams]
@@ -221,10 +204,10 @@ def _to_map_frame(
 def write_clouds(
     folder: Path,
     seen: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
+    poses: Float,
+    p_static: Float32,
     colours: NDArray[np.uint8] | None = None,
-    origin: NDArray[np.float64] | None = None,
+    origin: Float | None = None,
 ) -> None:
     """Write every hit to one of the two files; memory is that of a few scans.
 
@@ -243,8 +226,8 @@ def write_clouds(
         (folder / "static.ply").open("wb") as static,
         (folder / "dynamic.ply").open("wb") as moving,
     ):
-        static.write(ply_header(fields, cloud.count - dynamic))
-        moving.write(ply_header(fields, dynamic))
+        static.write(ply.make_header(fields, cloud.count - dynamic))
+        moving.write(ply.make_header(fields, dynamic))
         for block in cloud.iter_blocks():
             vertices = make_vertices(block, fields)
             moves = vertices["p_static"] < DYNAMIC_BELOW
@@ -261,7 +244,7 @@ def append_vertices(path: Path, block: Block) -> None:
     layout, whole = ply.read_layout(path), path.with_suffix(".whole")
     fields = [(name, layout.dtype[name].str.lstrip("|")) for name in layout.dtype.names or ()]
     with path.open("rb") as before, whole.open("wb") as file:
-        file.write(ply_header(fields, layout.rows + len(block.points)))
+        file.write(ply.make_header(fields, layout.rows + len(block.points)))
         before.seek(layout.start)
         shutil.copyfileobj(before, file)
         file.write(make_vertices(block, fields).tobytes())
@@ -279,13 +262,6 @@ def coordinate_fields(fields: Fields, is_far: bool) -> Fields:
     if not is_far:
         return fields
     return [(name, "<f8" if name in ("x", "y", "z") else kind) for name, kind in fields]
-
-
-def ply_header(fields: Fields, count: int) -> bytes:
-    """Of a little-endian PLY whose vertices have these fields, float32, float64 or uint8."""
-    properties = "".join(f"property {_TYPES[kind]} {name}\n" for name, kind in fields)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
-    return (head + "end_header\n").encode("ascii")
 
 
 def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:

@@ -11,16 +11,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Index
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.io.trajectory import pose_rows, poses_from_rows
 from stillmap.slam import PoseGraph
 from stillmap.slam.pose_graph import Constraint
-
-Float = NDArray[np.float64]
 
 _VERTEX = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 _EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
@@ -81,7 +79,7 @@ def read_g2o(path: Path) -> PoseGraph:
         InputError: the file is missing or damaged; names the line.
     """
     ids, rows, ends, edges, D = [], list[list[float]](), list[list[int]](), list[list[float]](), 0
-    for number, line in enumerate(_read_lines(path), start=1):
+    for number, line in enumerate(read_text(path, _MAX_BYTES).splitlines(), start=1):
         tag, *words = line.split() or [""]
         try:
             if tag in _VERTEX.values():
@@ -104,7 +102,7 @@ def read_g2o(path: Path) -> PoseGraph:
 
 
 def _to_constraints(
-    keyframes: NDArray[np.intp], ends: list[list[int]], edges: list[list[float]], D: int
+    keyframes: Index, ends: list[list[int]], edges: list[list[float]], D: int
 ) -> list[Constraint]:
     """The constraints of edges between vertices of these ids.
 
@@ -125,13 +123,6 @@ def _to_constraints(
         raise ValueError("the information of an edge is not positive definite")
     parts = zip(index.tolist(), _to_poses(values[:, :n_pose]), covariance, strict=True)
     return [Constraint(first, second, T, part) for (first, second), T, part in parts]
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return read_text(path, _MAX_BYTES).splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError("is damaged: no text", where=str(path)) from error
 
 
 def _floats(words: list[str], count: int) -> list[float]:

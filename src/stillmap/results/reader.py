@@ -9,23 +9,16 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from stillmap.core import se2
-from stillmap.core.array_folder import (
-    parse,
-    read_array,
-    read_npz,
-    read_probabilities,
-    read_record,
-)
+from stillmap.core import array_folder, se2
+from stillmap.core.array_folder import parse, read_array
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
-from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.trajectory import MAX_TRANSLATION
 
-Float = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
 RECORD = "run.json"  # every result has it
@@ -53,14 +46,14 @@ class Grid(GridMap):
     """An occupancy map as stored in `map.npz`."""
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Bool:
         return self.p_occupied > OCCUPIED_THRESH
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bool:
         return self.p_occupied < FREE_THRESH
 
-    def cells(self, points: Float) -> NDArray[np.int64]:
+    def cells(self, points: Float) -> Int64:
         """(N, 2) row and column of the cells that hold (N, 2) points; may lie outside the map."""
         T_grid_map = se2.inverse(se2.matrix(*self.origin))
         return np.floor(moved(T_grid_map, points) / self.resolution).astype(np.int64)[:, ::-1]
@@ -112,10 +105,10 @@ class Labels(ShortRepr):
         hit: (M,) whether the beam ended on something.
     """
 
-    stamp_ns: NDArray[np.int64]
-    offset: NDArray[np.int64]
-    p_static: NDArray[np.float32]
-    hit: NDArray[np.bool_]
+    stamp_ns: Int64
+    offset: Int64
+    p_static: Float32
+    hit: Bool
 
 
 def read_labels(result: Path) -> Labels:
@@ -124,30 +117,23 @@ def read_labels(result: Path) -> Labels:
     Raises:
         InputError: files are missing, damaged, or of inconsistent lengths.
     """
+    stamp_ns, offset, hit = read_beams(result)
+    p_static = array_folder.read_probabilities(result / "beams" / "p_static.npy", len(hit))
+    return Labels(stamp_ns, offset, p_static, hit)
+
+
+def read_beams(result: Path) -> tuple[Int64, Int64, Bool]:
+    """`stamp_ns`, `offset` and `hit` of `Labels`.
+
+    Raises:
+        InputError: files are missing, damaged, or of inconsistent lengths.
+    """
     folder = result / "beams"
     stamp_ns = read_array(folder / "stamp_ns.npy", (None,), np.int64)
     offset = read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64)
-    beams = int(offset[-1])
     if offset[0] != 0 or np.any(offset[1:] < offset[:-1]):
         raise InputError("does not rise from 0", where=str(folder / "offset.npy"))
-    p_static = read_probabilities(folder / "p_static.npy", beams)
-    return Labels(stamp_ns, offset, p_static, read_array(folder / "hit.npy", (beams,), np.bool_))
-
-
-def count_labels(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> dict[str, int]:
-    """`beams`, `hits`, `max_range`, `unusable` and `dynamic` of labels (M,)."""
-    hits = dynamic = unusable = 0
-    for block in iter_blocks(hit, p_static):
-        hits += int(np.count_nonzero(hit[block]))
-        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
-        unusable += int(np.count_nonzero(np.isnan(p_static[block])))
-    return {
-        "beams": len(hit),
-        "hits": hits,
-        "max_range": len(hit) - hits - unusable,
-        "unusable": unusable,
-        "dynamic": dynamic,
-    }
+    return stamp_ns, offset, read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
 
 
 def read_colors(result: Path, beams: int) -> NDArray[np.uint8] | None:
@@ -231,7 +217,9 @@ def _find_map(result: Path) -> Path:
 def _read_layer(path: Path, name: str, kinds: str) -> tuple[NDArray[Any], Origin, float]:
     """A layer (H, W) of one of these kinds of types, the origin (x, y, yaw) of its lower-left
     corner, and its resolution."""
-    layer, origin, edge = read_npz(path, (name, "origin", "resolution"), _MAX_MAP).values()
+    layer, origin, edge = array_folder.read_npz(
+        path, (name, "origin", "resolution"), _MAX_MAP
+    ).values()
     if layer.ndim != 2 or layer.dtype.kind not in kinds:
         hint = "maps are in the plane"
         raise InputError(f"{name} is {layer.shape} {layer.dtype}", where=str(path), hint=hint)
@@ -268,10 +256,10 @@ class Track(ShortRepr):
 
     id: int
     size: tuple[float, ...]
-    stamp_ns: NDArray[np.int64]
-    xy: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    z: NDArray[np.float64] | None = None
+    stamp_ns: Int64
+    xy: Float
+    velocity: Float
+    z: Float | None = None
     beams: int | None = None
     p_dynamic: float | None = None
     session: str = ""
@@ -337,20 +325,13 @@ def _to_track(one: _Object) -> Track:
 
 
 @dataclass(frozen=True)
-class _Quality:
-    overall: float | None = None
-    labels: float | None = None
-    geometry: float | None = None
-
-
-@dataclass(frozen=True)
 class _Run:
     """The entries of `run.json` that are read."""
 
     input: dict[str, Any]
     options: dict[str, Any] | None = None
     warnings: list[str] | None = None
-    quality: _Quality | None = None
+    quality: dict[str, float | None] | None = None
     dimension: int | None = None
 
 
@@ -361,6 +342,6 @@ def read_run(result: Path) -> dict[str, Any]:
         InputError: it is missing or damaged.
     """
     path = result / RECORD
-    record = read_record(path, HINT)
+    record = array_folder.read_record(path, HINT)
     parse(record, _Run, path)
     return record

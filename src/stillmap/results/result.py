@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shutil
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -241,11 +240,6 @@ def load(path: PathLike, *, recording: Source | None = None) -> Result:
         >>> result.plot()
     """
     return Result.open(path, recording)
-
-
-def remove_with(result: Result, folder: Path) -> None:
-    """Remove a temporary folder when the result in it is no longer used."""
-    weakref.finalize(result, shutil.rmtree, folder, ignore_errors=True)
 
 
 def to_options(options: Options | Mapping[str, Any] | None) -> Options:

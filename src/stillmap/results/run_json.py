@@ -6,16 +6,19 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.array_types import Bool
 from stillmap.core.files import package_version
+from stillmap.core.grid_map import GridMap
 from stillmap.core.json import to_jsonable
+from stillmap.core.recording import Recording
 from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.objects import MILLIMETRES
 from stillmap.results.reader import LOCAL_ORIGIN
 from stillmap.slam import LoopClosure
@@ -23,7 +26,6 @@ from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.tilting import TiltingResult
 
 
 def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -33,12 +35,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         result: the mapped recording.
         more: further keys and their values.
     """
-    counts = count_beams(result.recording, result.p_static)
-    counts = {
-        "scans": result.recording.n_scans,
-        **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-        "skipped": result.recording.source.n_skipped,
-    }
+    counts = count_beams(result.recording.hit, result.p_static)
     record = {
         "format_version": FORMAT_VERSION,
         "version": package_version(),
@@ -51,8 +48,8 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             key: {name: stage.get(key) for name, stage in result.stages.items()}
             for key in ("seconds", "cpu_seconds", "peak_memory_bytes")
         },
-        "counts": counts,
-        "area": known_area(result),
+        "counts": _counts(result.recording, counts),
+        "area": {"known": known_area(result.map), "thin": thin_area(result)},
         "warnings": list(result.warnings),
         "quality": quality_record(result.quality),
         "learned": result.learned,
@@ -69,6 +66,12 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
     }
     plain: dict[str, Any] = to_jsonable(record)
     return plain
+
+
+def _counts(recording: Recording, beams: Mapping[str, int], **more: int) -> dict[str, int]:
+    counts = {name: beams[name] for name in ("beams", "hits", "max_range", "unusable")}
+    skipped = recording.source.n_skipped
+    return {"scans": recording.n_scans, **counts, **more, "skipped": skipped}
 
 
 def _doubts(result: MappingResult) -> dict[str, Any]:
@@ -95,26 +98,26 @@ def quality_record(quality: Quality) -> dict[str, float | None]:
     return {name: getattr(quality, name) for name in ("overall", "labels", "geometry")}
 
 
-def known_area(result: MappingResult) -> dict[str, float]:
-    """`known`: m2 of the map of which beams tell something; `thin`: of these on thin evidence."""
-    cell = float(result.map.resolution) ** 2
-    layers = tiles_of(result.map.p_occupied), tiles_of(result.evidence.thinly_observed)
-    known = sum(int(np.count_nonzero(~np.isnan(part))) for _, part in layers[0])
-    thin = sum(int(np.count_nonzero(part)) for _, part in layers[1])
-    return {"known": round(cell * known, 6), "thin": round(cell * thin, 6)}
+def known_area(occupancy: GridMap) -> float:
+    """m2 of a map of which beams tell something."""
+    parts = tiles_of(occupancy.p_occupied)
+    known = sum(int(np.count_nonzero(~np.isnan(part))) for _, part in parts)
+    return round(float(occupancy.resolution) ** 2 * known, 6)
 
 
-def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
+def thin_area(result: MappingResult) -> float:
+    """m2 of the map that are known on thin evidence."""
+    parts = tiles_of(result.evidence.thinly_observed)
+    thin = sum(int(np.count_nonzero(part)) for _, part in parts)
+    return round(float(result.map.resolution) ** 2 * thin, 6)
+
+
+def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
     """The `tilting` entry of `run.json`."""
-    counts = count_beams(tilting.deskewed, tilting.p_static)
+    counts = count_beams(tilting.deskewed.hit, tilting.p_static)
     return {
         "input": tilting.recording.source.to_dict(),
-        "counts": {
-            "scans": tilting.recording.n_scans,
-            **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-            "left_out": tilting.unposed_beams,
-            "skipped": tilting.recording.source.n_skipped,
-        },
+        "counts": _counts(tilting.recording, counts, left_out=tilting.unposed_beams),
         "dynamic": counts["dynamic"],
         "boxes": tilting.boxes_hit,
         "objects": len(tilting.objects),
@@ -127,7 +130,7 @@ def models_record(models: "Models") -> dict[str, Any]:
     place = models.assignment
     areas = place.mesh.areas()
 
-    def area(of: NDArray[np.bool_]) -> float:
+    def area(of: Bool) -> float:
         return round(float(areas[of].sum()), 4)
 
     used = {view.image for k, view in enumerate(models.views) if (place.view == k).any()}

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float
 from stillmap.core.errors import import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.local_frame import FAR
@@ -21,7 +22,6 @@ from stillmap.tracking.objects import mean_speed, track_length
 if TYPE_CHECKING:
     import pyarrow
 
-Float = NDArray[np.float64]
 TableName = Literal["beams", "poses", "objects", "tracks"]
 
 _ROWS = 1 << 20  # of a part of the beams, approximately

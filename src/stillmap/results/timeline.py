@@ -8,16 +8,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from stillmap.core.array_folder import parse, read_npz
+from stillmap.core.array_types import Bool, Float, Index, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
 from stillmap.results.reader import SESSIONS, Stamp
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Kind = Literal["appeared", "gone", "moved", "door"]
 Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 
@@ -187,10 +185,10 @@ class ChangedCells(ShortRepr):
         resolution: m, edge of a cell.
     """
 
-    cells: NDArray[np.int64]
-    occupied: Mask
-    observed: Mask
-    shown: Mask
+    cells: Int64
+    occupied: Bool
+    observed: Bool
+    shown: Bool
     resolution: float
 
     @property
@@ -198,15 +196,12 @@ class ChangedCells(ShortRepr):
         """(K, 2) m."""
         return np.asarray((self.cells + 0.5) * self.resolution)
 
-    def occupied_as_of(self, session: int) -> Mask:
+    def occupied_as_of(self, session: int) -> Bool:
         """(K,) what the last session up to this one saw, else the first one after."""
-        before = self.observed[:, : session + 1]
-        last = session - np.argmax(before[:, ::-1], axis=1)
-        first_after = np.argmax(self.observed, axis=1)
-        at = np.where(before.any(axis=1), last, first_after)
+        at = last_observed(self.observed, session)
         return np.asarray(self.occupied[np.arange(len(at)), at])
 
-    def within(self, changes: list[SessionChange]) -> Mask:
+    def within(self, changes: list[SessionChange]) -> Bool:
         """(K,) whether a cell lies in the box of one of these changes."""
         out, centers = np.zeros(len(self.cells), np.bool_), self.centers
         margin = _WHOLE_CELL * self.resolution
@@ -214,6 +209,14 @@ class ChangedCells(ShortRepr):
             inside = (centers > low[:2] - margin) & (centers < high[:2] + margin)
             out |= inside.all(axis=1)
         return out
+
+
+def last_observed(observed: Bool, session: int) -> Index:
+    """(K,) the last session up to this one that observed each cell (K, S), else the first after."""
+    before = observed[:, : session + 1]
+    last = session - np.argmax(before[:, ::-1], axis=1)
+    first_after = np.argmax(observed, axis=1)
+    return np.asarray(np.where(before.any(axis=1), last, first_after), np.intp)
 
 
 def read_states(folder: Path) -> tuple[ChangedCells, list[str]]:
@@ -248,14 +251,12 @@ class Timeline(ShortRepr):
         refused: those that are not in the place.
         changes: in the order of time.
         cells: that changed.
-        map_state: which state the map shows: `last`, `majority`, a session or a date.
     """
 
     sessions: list[PlaceSession]
     refused: list[PlaceSession]
     changes: list[SessionChange]
     cells: ChangedCells
-    map_state: str
 
     def changes_at(self, session: int) -> list[SessionChange]:
         """The changes that a session was the first to see."""
@@ -275,7 +276,7 @@ class Timeline(ShortRepr):
             return days[session]
         return format_date_time(self.sessions[session].first_ns)
 
-    def cells_as_of(self, session: int) -> tuple[Mask, Mask, Mask]:
+    def cells_as_of(self, session: int) -> tuple[Bool, Bool, Bool]:
         """(K,) cells occupied as of a session, and which of them came and left since the one
         before by a change that is listed."""
         now = self.cells.occupied_as_of(session)
@@ -284,12 +285,8 @@ class Timeline(ShortRepr):
         return now, now & ~before & listed, before & ~now & listed
 
 
-def read_timeline(folder: Path, map_state: str = "last") -> Timeline:
-    """The sessions of a place and what changed between them.
-
-    Args:
-        folder: which `stillmap merge` wrote.
-        map_state: which state its map shows, as `run.json` says it.
+def read_timeline(folder: Path) -> Timeline:
+    """The sessions of a place, which `stillmap merge` wrote, and what changed between them.
 
     Raises:
         InputError: a file is missing, damaged, or was changed by hand.
@@ -302,7 +299,7 @@ def read_timeline(folder: Path, map_state: str = "last") -> Timeline:
         raise InputError(what, where=str(folder / STATES), hint=HINT)
     refused = [one for one in sessions if not one.accepted]
     changes = read_changes(folder, names)
-    return Timeline([accepted[name] for name in names], refused, changes, cells, map_state)
+    return Timeline([accepted[name] for name in names], refused, changes, cells)
 
 
 def format_date_time(stamp_ns: int) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import write_arrays
+from stillmap.core.array_types import Float32
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, write_text
 from stillmap.core.grid_map import GridMap, Region, is_inside, limit_hits
@@ -18,6 +19,7 @@ from stillmap.core.tiles import Block, cut
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import extent
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.point_cloud import write_clouds
@@ -29,7 +31,6 @@ from stillmap.tracking import FlowMap, MovingObject
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.tilting import TiltingResult
 
 Some = TypeVar("Some", bound=MappingResult)
 _MAP_LAYERS = ("p_occupied", "alpha", "beta")
@@ -42,7 +43,7 @@ def save(
     overwrite: bool = False,
     *,
     marker: str = RECORD,
-    tilting: "TiltingResult | None" = None,
+    tilting: TiltingResult | None = None,
     models: "Models | None" = None,
     write_more: Callable[[Path], None] | None = None,
 ) -> None:
@@ -96,10 +97,7 @@ def save(
 
 
 def write_labels(
-    folder: Path,
-    recording: Recording,
-    p_static: NDArray[np.float32],
-    colors: NDArray[np.uint8] | None = None,
+    folder: Path, recording: Recording, p_static: Float32, colors: NDArray[np.uint8] | None = None
 ) -> None:
     """Writes `stamp_ns`, `offset`, `p_static` and `hit` as .npy files into the new `folder`.
 
@@ -126,7 +124,7 @@ def write_labels(
 
 
 def _write_tilting(
-    folder: Path, tilting: "TiltingResult", colors: NDArray[np.uint8] | None, region: Region | None
+    folder: Path, tilting: TiltingResult, colors: NDArray[np.uint8] | None, region: Region | None
 ) -> None:
     """Write labels, poses and objects in 3D into a new folder."""
     folder.mkdir()

@@ -164,7 +164,11 @@ def write(recording: Recording, path: Path, poses: Float) -> None:
         InputError: `path` cannot be written, or laspy is missing.
     """
     laspy = import_extra("laspy", path, "written")
-    header, compressed = _make_header(laspy, poses), path.name.lower().endswith(".laz")
+    # 32 bit coordinates, relative to the first pose
+    origin = np.zeros(3)
+    if len(poses):
+        origin[: poses.shape[-1] - 1] = np.round(poses[0, :-1, -1])
+    header, compressed = make_header(laspy, 0, "1.2", origin), path.name.lower().endswith(".laz")
     with atomic_file(path) as work, open_las_writer(work, laspy, header, compressed) as writer:
         for points in clouds.iter_map_points(recording, poses):
             block = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
@@ -215,13 +219,10 @@ class _ErrorKeepingWriter(io.BufferedWriter):
             raise
 
 
-def _make_header(laspy: Any, poses: Float) -> Any:
-    header = laspy.LasHeader(point_format=0, version="1.2")
-    header.scales = np.full(3, SCALE)
-    # 32 bit coordinates, relative to the first pose
-    header.offsets = np.zeros(3)
-    if len(poses):
-        header.offsets[: poses.shape[-1] - 1] = np.round(poses[0, :-1, -1])
+def make_header(laspy: Any, kind: int, version: str, origin: Float) -> Any:
+    """A LasHeader of points of a format, whose coordinates are relative to an origin (3,)."""
+    header = laspy.LasHeader(point_format=kind, version=version)
+    header.scales, header.offsets = np.full(3, SCALE), origin
     header.generating_software = "stillmap"
     # fixed, so that equal recordings give equal files
     header.creation_date = date(1970, 1, 1)

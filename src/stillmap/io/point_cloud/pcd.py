@@ -179,12 +179,19 @@ def write(recording: Recording, path: Path, overwrite: bool = False) -> list[str
 def _encode_scan(recording: Recording, scan: int, T: Float) -> bytes:
     points, times = clouds.scan_hits(recording, scan)
     rows = points if times is None else np.column_stack([points, times])
-    names = ["x", "y", "z", "time"][: rows.shape[1]]
-    viewpoint = " ".join(f"{value:.17g}" for value in (*T[:3, 3], *quaternion_from_pose(T)))
-    n = len(names)
+    fields = [(name, "<f4") for name in ("x", "y", "z", "time")[: rows.shape[1]]]
+    return make_header(fields, len(rows), T) + rows.astype("<f4").tobytes()
+
+
+def make_header(fields: table.Fields, count: int, viewpoint: Float) -> bytes:
+    """Of binary points with these fields, all of them of TYPE F: packed colours are, too, by
+    convention of PCL; `viewpoint` (4, 4)."""
+    n, pose = len(fields), (*viewpoint[:3, 3], *quaternion_from_pose(viewpoint))
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
-        f"FIELDS {' '.join(names)}\nSIZE{' 4' * n}\nTYPE{' F' * n}\nCOUNT{' 1' * n}\n"
-        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(rows)}\nDATA binary\n"
+        f"FIELDS {' '.join(name for name, _ in fields)}\n"
+        f"SIZE {' '.join(kind[-1] for _, kind in fields)}\nTYPE{' F' * n}\nCOUNT{' 1' * n}\n"
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT {' '.join(f'{value:.17g}' for value in pose)}\n"
+        f"POINTS {count}\nDATA binary\n"
     )
-    return header.encode() + rows.astype("<f4").tobytes()
+    return header.encode()

@@ -21,6 +21,7 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+_NAMES = {"<f4": "float", "<f8": "double", "u1": "uchar"}  # of what is written
 
 
 def is_ply(head: bytes) -> bool:
@@ -91,6 +92,13 @@ def _parse_header(path: Path, lines: list[list[str]], header: int) -> table.Tabl
     raise ValueError("no vertices")
 
 
+def make_header(fields: table.Fields, count: int) -> bytes:
+    """Of a little-endian file whose vertices have these fields, float32, float64 or uint8."""
+    properties = "".join(f"property {_NAMES[kind]} {name}\n" for name, kind in fields)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
+    return (head + "end_header\n").encode("ascii")
+
+
 def write(recording: Recording, path: Path, poses: Float) -> None:
     """Write all hits in the map frame as one binary cloud, atomically.
 
@@ -102,10 +110,8 @@ def write(recording: Recording, path: Path, poses: Float) -> None:
     Raises:
         InputError: `path` cannot be written.
     """
-    n = int(np.count_nonzero(recording.hit))
     with atomic_file(path) as work, work.open("wb") as file:
-        names = "".join(f"property double {name}\n" for name in "xyz")
-        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{names}end_header\n"
-        file.write(head.encode())
+        fields = [(name, "<f8") for name in "xyz"]
+        file.write(make_header(fields, int(np.count_nonzero(recording.hit))))
         for points in clouds.iter_map_points(recording, poses):
             file.write(points.astype("<f8").tobytes())

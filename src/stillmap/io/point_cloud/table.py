@@ -37,6 +37,9 @@ _SAME_CLOCK_NS = 10 * 10**9
 Columns = Sequence[NDArray[Any]]  # values (k,) of each column
 
 
+Fields = list[tuple[str, str]]  # names and types of what is written
+
+
 @dataclass(frozen=True)
 class TableLayout:
     """Position and columns of the points in a file.

@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.json import to_jsonable
-
-Float = NDArray[np.float64]
-
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -82,6 +79,7 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
         raise ValueError("p_static: probabilities must lie in [0, 1]")
     y = ~static[labelled]
     q = 1.0 - p
+    clipped = np.clip(q, LOG_LOSS_EPS, 1.0 - LOG_LOSS_EPS)
     unsure = (q > UNSURE[0]) & (q < UNSURE[1])
     bins_unsure = assign_equal_mass_bins(q[unsure])
     precision, recall, f1 = compute_precision_recall_f1(p < 0.5, y)
@@ -95,7 +93,7 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
         recall=recall,
         f1=f1,
         brier=mean((q - y) ** 2),
-        log_loss=compute_log_loss(q, y),
+        log_loss=mean(-np.log(np.where(y, clipped, 1.0 - clipped))),
         ece=compute_calibration_error(q, y, assign_equal_width_bins(q)),
         unsure=int(unsure.sum()),
         ece_unsure=compute_calibration_error(q[unsure], y[unsure], bins_unsure),
@@ -130,25 +128,19 @@ def compute_precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, fl
     )
 
 
-def compute_log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> float:
-    """Mean of -ln P(truth), in nats, P clipped to [eps, 1 - eps]."""
-    p = np.clip(p, eps, 1.0 - eps)
-    return mean(-np.log(np.where(positive, p, 1.0 - p)))
-
-
-def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> Index:
     """Bin of each probability: [0, 1/bins), ..., [1 - 1/bins, 1]."""
     return np.minimum((p * bins).astype(np.intp), bins - 1)
 
 
-def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> Index:
     """Quantile bin of each probability; equal ones share a bin."""
     _, group, size = np.unique(p, return_inverse=True, return_counts=True)
     middle = np.cumsum(size) - size / 2
     return (middle * bins / max(len(p), 1)).astype(np.intp)[group]
 
 
-def compute_calibration_error(p: Float, positive: Bool, bin_of: NDArray[np.intp]) -> float:
+def compute_calibration_error(p: Float, positive: Bool, bin_of: Index) -> float:
     """Mean over all beams of |share of positives - mean p| of their bin (Naeini et al. 2015)."""
     if not len(p):
         return NAN

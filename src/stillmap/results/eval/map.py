@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy  # its parts load when they are first used
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float
 from stillmap.results.eval.labels import Scores
-from stillmap.results.reader import Float, Grid, moved
+from stillmap.results.reader import Grid, moved
 
 GHOST_DISTANCE = 2.0  # cells from the nearest wall
 
@@ -104,7 +104,7 @@ def distance_to_walls(points: Float, walls: Float, chunk: int = 1 << 20) -> Floa
     return out
 
 
-def is_near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
+def is_near_occupied(grid: Grid, points: Float) -> Bool:
     """(N,) whether the cell of each point (N, 2) of the map frame, or a neighbour, is occupied."""
     near = scipy.ndimage.binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
     cells = grid.cells(points) + 1

@@ -4,13 +4,12 @@ import logging
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
 from stillmap.core.array_folder import read_array
+from stillmap.core.array_types import Bool, Float, Int64
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
@@ -18,12 +17,8 @@ from stillmap.io.carmen.log import CarmenLog, read_log
 from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
-from stillmap.io.trajectory import MAX_BYTES, read_tum
+from stillmap.io.trajectory import MAX_BYTES, embed_in_3d, read_tum
 from stillmap.results.reader import Labels
-
-Bool = NDArray[np.bool_]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,34 +36,36 @@ class Truth:
         """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
         if self.recording.dimension != 2:
             raise InputError("is not a planar recording", where=str(self.folder))
-        path = self.folder / "truth/walls.npy"
-        walls = _finite(path, read_array(path, (None, 4), np.float64))
+        walls = self._read("walls", (None, 4))
         if not len(walls):
-            raise InputError("holds no walls", where=str(path))
+            raise InputError("holds no walls", where=str(self.folder / "truth/walls.npy"))
         return walls
 
     def lasting(self) -> Float:
         """(K, 4) segments of moved or added objects that are there at the end."""
-        path = self.folder / "truth/lasting.npy"
-        if not path.exists():
+        if not (self.folder / "truth/lasting.npy").exists():
             return np.empty((0, 4))
-        return _finite(path, read_array(path, (None, 4), np.float64))
+        return self._read("lasting", (None, 4))
 
     def poses(self) -> Float:
         """(T, D+1, D+1) T_world_base."""
-        path = self.folder / "truth/T_world_base.npy"
         n = self.recording.dimension + 1
-        return _finite(path, read_array(path, (self.recording.n_scans, n, n), np.float64))
+        return self._read("T_world_base", (self.recording.n_scans, n, n))
 
     def static_hits(self) -> Float:
         """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
         use, recording = np.flatnonzero(self.recording.hit & self.static()), self.recording
-        path = self.folder / "truth/T_base_sensor.npy"
-        if path.exists():  # the recorder was wrong about its mount
-            shape = recording.T_base_sensor.shape
-            T_base_sensor = _finite(path, read_array(path, shape, np.float64))
+        if (self.folder / "truth/T_base_sensor.npy").exists():  # it was wrong about its mount
+            T_base_sensor = self._read("T_base_sensor", recording.T_base_sensor.shape)
             recording = replace(recording, T_base_sensor=T_base_sensor)
         return recording.end_points(use, self.poses())
+
+    def _read(self, name: str, shape: tuple[int | None, ...]) -> Float:
+        path = self.folder / "truth" / f"{name}.npy"
+        array = read_array(path, shape, np.float64)
+        if not np.isfinite(array).all():
+            raise InputError("holds a number that is not finite", where=str(path))
+        return array
 
 
 def read_truth(path: Path, labels: Labels | None = None) -> Truth:
@@ -125,12 +122,6 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
         raise InputError(what, where=where, hint=hint)
 
 
-def _finite(path: Path, array: NDArray[Any]) -> Float:
-    if not np.isfinite(array).all():
-        raise InputError("holds a number that is not finite", where=str(path))
-    return np.asarray(array, np.float64)
-
-
 _RELATION = "t1 t2 x y z roll pitch yaw"
 
 _POSE = "t x y theta, or stamp x y z qx qy qz qw"
@@ -156,8 +147,7 @@ def read_trajectory(path: Path) -> Trajectory:
     """
     if len(_first_row(path, _POSE)) == 4:
         rows = _rows(path, 4, "t x y theta")
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, [[0], [1], [3]], [0, 1, 3]] = se2.matrix(*rows[:, 1:].T)
+        poses = embed_in_3d(se2.matrix(*rows[:, 1:].T))
         stamps = rows[:, 0]
     else:
         stamp_ns, poses = read_tum(path)
@@ -202,7 +192,7 @@ def read_odometry(path: Path) -> Float:
     return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
-def to_seconds(stamp_ns: NDArray[np.int64]) -> Float:
+def to_seconds(stamp_ns: Int64) -> Float:
     """The double nearest to each stamp, as if parsed from its decimal text.
 
     Dividing the array would round twice, which moves current stamps by up to 2e-7 s.
@@ -233,12 +223,8 @@ def _first_row(path: Path, wanted: str) -> list[str]:
 
 def _rows(path: Path, columns: int, names: str) -> Float:
     """(N, columns) finite numbers; # begins a comment."""
-    try:
-        lines = read_text(path, MAX_BYTES).splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=str(path)) from error
     rows = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path, MAX_BYTES).splitlines(), start=1):
         words = line.split("#")[0].split()
         try:
             row = [float(word) for word in words]

@@ -16,12 +16,13 @@ from typing import Literal
 
 import numpy as np
 import scipy  # its parts load when they are first used
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.errors import InputError
+from stillmap.io.trajectory import nearest_index
 from stillmap.results.eval import readers
-from stillmap.results.eval.labels import Float, Scores
+from stillmap.results.eval.labels import NAN, Scores
 from stillmap.results.eval.readers import Truth
 
 Unit = Literal["m", "frames"]
@@ -30,19 +31,6 @@ _PLANAR_TOLERANCE = 1e-6  # metres and sines: rounding of text and quaternions
 _PATH_TOLERANCE = 0.1  # of the distance between the poses of a pair
 _STAMP_TOLERANCE = 1e-6  # s: a result carries the stamps of its recording
 MAX_DT = 0.1  # s of relations, as in the authors' program
-
-
-def nearest_index(
-    stamps: NDArray[np.float64], at: NDArray[np.float64]
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Index of the nearest of sorted `stamps` (N >= 1) to each of `at`, and the distance to it.
-
-    Of two equally near ones the earlier. Any unit; also used for distances along a path.
-    """
-    after = np.searchsorted(stamps, at).clip(0, len(stamps) - 1)
-    before = (after - 1).clip(0)
-    index = np.where(np.abs(stamps[before] - at) <= np.abs(stamps[after] - at), before, after)
-    return index, np.abs(stamps[index] - at)
 
 
 @dataclass(frozen=True)
@@ -66,7 +54,7 @@ class RelativeErrors(Scores):
 
 def associate_trajectories(
     estimated_s: Float, reference_s: Float, max_dt: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Index, Index]:
     """Indices of matching poses by their stamps.
 
     Equal arrays of stamps match one to one. Else each pose of the shorter trajectory is matched
@@ -82,8 +70,8 @@ def associate_trajectories(
         return np.arange(len(estimated_s)), np.arange(len(estimated_s))
     swap = len(estimated_s) > len(reference_s)
     few, many = (reference_s, estimated_s) if swap else (estimated_s, reference_s)
-    partner, distance = nearest_index(many, few)
-    near = np.flatnonzero(distance <= max_dt)
+    partner = nearest_index(many, few)
+    near = np.flatnonzero(np.abs(many[partner] - few) <= max_dt)
     if not len(near):
         what = f"no two stamps lie within {max_dt:g} s of each other"
         raise InputError(what, hint="other clocks? see max_dt=SECONDS")
@@ -108,20 +96,6 @@ def _is_flat(T: Float) -> bool:
     return bool(np.all(np.abs(T[:, 2, :] - (0.0, 0.0, 1.0, 0.0)) < _PLANAR_TOLERANCE))
 
 
-def align_points(source: Float, target: Float) -> Float:
-    """(D+1, D+1) rigid T that minimises sum |target - T source|^2 over (N, D) points, N >= 1."""
-    centre_source, centre_target = source.mean(0), target.mean(0)
-    U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
-    D = source.shape[1]
-    # keep R a rotation: the last axis costs least to reverse
-    flip = np.ones(D)
-    flip[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    T = np.eye(D + 1)
-    T[:D, :D] = (U * flip) @ Vt
-    T[:D, D] = centre_target - T[:D, :D] @ centre_source
-    return T
-
-
 def align(estimated: Float, truth: Float, lever: float = 1.0) -> Float:
     """T_truth_estimated that aligns estimated with true poses, (N, D+1, D+1) each, N >= 1.
 
@@ -129,7 +103,7 @@ def align(estimated: Float, truth: Float, lever: float = 1.0) -> Float:
     headings determine the rotation where positions do not (a robot at rest, or on a straight
     line), and weigh little against a path much longer than the lever.
     """
-    return align_points(_arms(estimated, lever), _arms(truth, lever))
+    return se2.align_points(_arms(estimated, lever), _arms(truth, lever))
 
 
 def _arms(T: Float, lever: float) -> Float:
@@ -147,7 +121,7 @@ def compute_absolute_errors(estimated: Float, reference: Float) -> ErrorStats:
     """
     D = estimated.shape[-1] - 1
     source, target = estimated[:, :D, D], reference[:, :D, D]
-    T = align_points(source, target)
+    T = se2.align_points(source, target)
     return summarize_errors(np.linalg.norm(target - (source @ T[:D, :D].T + T[:D, D]), axis=1))
 
 
@@ -174,7 +148,7 @@ def compute_relative_errors(
     )
 
 
-def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[Index, Index]:
     if unit == "frames":
         step = round(delta)
         if step != delta or step < 1:
@@ -185,8 +159,9 @@ def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp]
         raise InputError(f"a step of {delta:g} m is not positive")
     position = reference[:, :-1, -1]
     path = np.concatenate([[0.0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
-    second, off = nearest_index(path, path + delta)
-    first = np.flatnonzero(off <= _PATH_TOLERANCE * delta)
+    ends = path + delta
+    second = nearest_index(path, ends)
+    first = np.flatnonzero(np.abs(path[second] - ends) <= _PATH_TOLERANCE * delta)
     return first, second[first]
 
 
@@ -202,18 +177,12 @@ def _angle(R: Float) -> Float:
 def summarize_errors(error: Float) -> ErrorStats:
     """Summary of (N,) errors."""
     if not len(error):
-        return ErrorStats(*[float("nan")] * 4)
-    return ErrorStats(
-        rmse=float(np.sqrt(np.mean(error**2))),
-        mean=float(error.mean()),
-        median=float(np.median(error)),
-        max=float(error.max()),
-    )
+        return ErrorStats(*[NAN] * 4)
+    rmse = np.sqrt(np.mean(error**2))
+    return ErrorStats(*map(float, (rmse, error.mean(), np.median(error), error.max())))
 
 
-def read_paired_poses(
-    result: Path, truth: Truth
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_paired_poses(result: Path, truth: Truth) -> tuple[Float, Float]:
     """Poses (N, 4, 4) of a result and true ones (N, D+1, D+1) at the same stamps.
 
     Raises:
@@ -300,14 +269,14 @@ def compute_relation_errors(
 
 def _look_up_poses(
     times: Float, trajectory: Float, odometry: Float | None, max_dt: float
-) -> tuple[Float, NDArray[np.bool_], int]:
-    index, distance = nearest_index(trajectory[:, 0], times)
+) -> tuple[Float, Bool, int]:
+    index = nearest_index(trajectory[:, 0], times)
     poses = trajectory[index, 1:]
-    far = distance > max_dt
+    far = np.abs(trajectory[index, 0] - times) > max_dt
     if odometry is None:
         return poses, ~far, 0
-    start, _ = nearest_index(odometry[:, 0], trajectory[index[far], 0])
-    end, _ = nearest_index(odometry[:, 0], times[far])
+    start = nearest_index(odometry[:, 0], trajectory[index[far], 0])
+    end = nearest_index(odometry[:, 0], times[far])
     step = _displacement(odometry[start, 1:], odometry[end, 1:])
     poses[far] = se2.parameters(se2.matrix(*poses[far].T) @ se2.matrix(*step.T))
     return poses, np.ones(len(times), bool), int(far.sum())
@@ -320,17 +289,7 @@ def _displacement(a: Float, b: Float) -> Float:
 
 def _summarize(error: Float) -> Spread:
     if not len(error):
-        return Spread(*[float("nan")] * 6)
-    squared = error**2
-    return Spread(
-        mean=float(error.mean()),
-        std=_sample_std(error),
-        squared_mean=float(squared.mean()),
-        squared_std=_sample_std(squared),
-        median=float(np.median(error)),
-        max=float(error.max()),
-    )
-
-
-def _sample_std(values: Float) -> float:
-    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
+        return Spread(*[NAN] * 6)
+    ddof = int(len(error) > 1)  # the deviation of one error is 0
+    spreads = [(values.mean(), values.std(ddof=ddof)) for values in (error, error**2)]
+    return Spread(*map(float, (*spreads[0], *spreads[1], np.median(error), error.max())))

@@ -5,37 +5,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_types import Float, Int64
 from stillmap.core.grid_map import limit_hits
 from stillmap.core.local_frame import find_origin, shift_poses
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.ros import message_fields as ros
+from stillmap.io.ros import writer
 from stillmap.io.ros.message_fields import BASE, MAP, ODOM, Fields, LaserScanEncoder
 from stillmap.io.ros.messages import LASER_SCAN, ODOMETRY, POINT_CLOUD, TF, BagKind
-from stillmap.io.ros.writer import (
-    GRID,
-    MARKERS,
-    PATH,
-    BagWriter,
-    new_bag,
-    number_names,
-    require_stamps,
-    write_sensor_frames,
-)
+from stillmap.results import point_cloud
 from stillmap.results.mapped_place import MappedPlace
 from stillmap.results.objects import Mover, interpolate_pose, iter_present_tracks
-from stillmap.results.point_cloud import (
-    FIELDS,
-    PACKED_COLOUR,
-    Block,
-    cloud_from_recording,
-    make_vertices,
-)
 
-Float = NDArray[np.float64]
 Progress = Callable[[float], None]
 ScanWriter = Callable[[int], None]
 
@@ -78,13 +62,13 @@ def write(
         InputError: the bag cannot be written or cannot hold the scans.
     """
     recording, stamps = result.recording, result.recording.stamp_ns.tolist()
-    require_stamps(stamps[0], stamps[-1], kind)
+    writer.require_stamps(stamps[0], stamps[-1], kind)
     encoder = LaserScanEncoder(recording) if recording.dimension == 2 else None
     seen = recording if recording.dimension == 2 else result.deskewed
-    with new_bag(path, kind, overwrite=overwrite) as bag:
+    with writer.new_bag(path, kind, overwrite=overwrite) as bag:
         origin = find_origin(result.poses)  # sessions of a place state none of their own
         more = [(MAP, _LOCAL, shift_poses(np.eye(4), origin))] if origin.any() else []
-        frames = write_sensor_frames(bag, recording, more)
+        frames = writer.write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
         if encoder is None:
             _write_static_points(bag, result, seen, origin)
@@ -104,24 +88,24 @@ def write(
     return [] if encoder is None else encoder.describe_losses()
 
 
-def _write_latched_topics(bag: BagWriter, result: MappedPlace) -> None:
+def _write_latched_topics(bag: writer.BagWriter, result: MappedPlace) -> None:
     """Map and trajectory, as one latched message each."""
     stamp_ns, grid = result.recording.stamp_ns, result.map
     first = int(stamp_ns[0])
-    send = bag.add_topic("/map", GRID, latched=True)
+    send = bag.add_topic("/map", writer.GRID, latched=True)
     corner = se2.matrix(*grid.origin)
     send(first, ros.make_occupancy_grid(first, grid.p_occupied, corner, grid.resolution))
-    send = bag.add_topic("/trajectory", PATH, latched=True)
+    send = bag.add_topic("/trajectory", writer.PATH, latched=True)
     send(first, ros.make_path(stamp_ns, result.poses))
 
 
 def _write_static_points(
-    bag: BagWriter, result: MappedPlace, deskewed: Recording, origin: Float
+    bag: writer.BagWriter, result: MappedPlace, deskewed: Recording, origin: Float
 ) -> None:
     """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
     programs expect coordinates of 32 bits."""
     seen = limit_hits(deskewed, result.poses, result.loaded.output_options.region)
-    cloud = cloud_from_recording(
+    cloud = point_cloud.cloud_from_recording(
         result.recording, seen, result.poses, result.p_static, "static", result.colors
     )
     first = int(result.recording.stamp_ns[0])
@@ -131,19 +115,23 @@ def _write_static_points(
     send(first, _make_cloud(first, _LOCAL if origin.any() else MAP, block))
 
 
-def _make_cloud(stamp_ns: int, frame: str, block: Block) -> Fields:
+def _make_cloud(stamp_ns: int, frame: str, block: point_cloud.Block) -> Fields:
     """A PointCloud2 of points in a frame: x, y, z, `p_static`, and `rgb` for colours."""
-    fields = FIELDS if block.colors is None else FIELDS + PACKED_COLOUR
-    return ros.make_point_cloud(stamp_ns, frame, make_vertices(block, fields))
+    fields = (
+        point_cloud.FIELDS
+        if block.colors is None
+        else point_cloud.FIELDS + point_cloud.PACKED_COLOUR
+    )
+    return ros.make_point_cloud(stamp_ns, frame, point_cloud.make_vertices(block, fields))
 
 
 def _make_scan_writer(
-    bag: BagWriter, result: MappedPlace, encoder: LaserScanEncoder, frames: Sequence[str]
+    bag: writer.BagWriter, result: MappedPlace, encoder: LaserScanEncoder, frames: Sequence[str]
 ) -> ScanWriter:
     """A function that writes a scan to the static and the dynamic topic of its laser: in each the
     beams of the other one are NaN."""
     recording, p_static = result.recording, result.p_static
-    names = [f"/{name}" for name in number_names("scan", len(frames))]
+    names = [f"/{name}" for name in writer.number_names("scan", len(frames))]
     static = [bag.add_topic(name, LASER_SCAN) for name in names]
     dynamic = [bag.add_topic(f"{name}_dynamic", LASER_SCAN) for name in names]
 
@@ -159,10 +147,10 @@ def _make_scan_writer(
 
 
 def _make_sweep_writer(
-    bag: BagWriter, result: MappedPlace, deskewed: Recording, frames: Sequence[str]
+    bag: writer.BagWriter, result: MappedPlace, deskewed: Recording, frames: Sequence[str]
 ) -> ScanWriter:
     """A function that writes the returns of a sweep in the frame of its lidar at the stamp."""
-    names = number_names("points", len(frames))
+    names = writer.number_names("points", len(frames))
     sends = [bag.add_topic(f"/{name}", POINT_CLOUD) for name in names]
 
     def write_sweep(t: int) -> None:
@@ -170,13 +158,13 @@ def _make_sweep_writer(
         hit = deskewed.hit[beams]
         colors = None if result.colors is None else result.colors[beams][hit]
         points = deskewed.points[beams][hit].astype(np.float64)
-        block = Block(points, result.p_static[beams][hit], None, colors)
+        block = point_cloud.Block(points, result.p_static[beams][hit], None, colors)
         sends[s](stamp, _make_cloud(stamp, frames[s], block))
 
     return write_sweep
 
 
-def _make_frame_writer(bag: BagWriter, result: MappedPlace) -> ScanWriter:
+def _make_frame_writer(bag: writer.BagWriter, result: MappedPlace) -> ScanWriter:
     """A function that writes the frames, and the odometry, of a scan."""
     stamp_ns, T_odom_base = result.recording.stamp_ns, result.recording.T_odom_base
     send_tf = bag.add_topic("/tf", TF)
@@ -197,13 +185,13 @@ def _make_frame_writer(bag: BagWriter, result: MappedPlace) -> ScanWriter:
 
 
 def _make_object_writer(
-    bag: BagWriter, tracks: Sequence[Mover], stamp_ns: NDArray[np.int64]
+    bag: writer.BagWriter, tracks: Sequence[Mover], stamp_ns: Int64
 ) -> ScanWriter:
     """A function that writes the markers at a scan; the scans (T,) come in order.
 
     Each message begins with a marker that removes the earlier ones.
     """
-    send = bag.add_topic("/objects", MARKERS)
+    send = bag.add_topic("/objects", writer.MARKERS)
     present_at, shown = iter_present_tracks(tracks, stamp_ns), list[int]()
 
     def write_markers(t: int) -> None:

@@ -45,7 +45,6 @@ def write(
         OSError: the file cannot be created.
     """
     library = import_extra("pye57.libe57", path, "written")
-    require_name(path)
     path.open("wb").close()  # raises an OSError that names the reason; libe57 does not
     try:
         file = library.ImageFile(str(path), "w")
@@ -102,10 +101,7 @@ def _write_scan(
 
 
 def _write_points(
-    writer: Any,
-    values: list[Float],
-    cloud: Cloud,
-    progress: Callable[[float], None] | None,
+    writer: Any, values: list[Float], cloud: Cloud, progress: Callable[[float], None] | None
 ) -> tuple[str, Float, Float]:
     """Write all points through the buffers `values`; their digest, and their bounds (3,), (3,)."""
     digest, low, high = hashlib.sha256(), np.full(3, np.inf), np.full(3, -np.inf)

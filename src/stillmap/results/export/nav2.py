@@ -2,25 +2,20 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Bool
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder, write_text
 from stillmap.pipeline.options import MapMode
-from stillmap.results.export.zones import Action, SpeedLimit, Zone, cells_inside, is_within
+from stillmap.results.export.zones import SpeedLimit, Zone, cells_inside, is_within
 from stillmap.results.map_server import write_keepout_mask, write_map_server, write_speed_mask
 from stillmap.results.reader import Crossings, Grid
 from stillmap.results.report.template import render
-
-Mask = NDArray[np.bool_]
-
-_TRAFFIC = "traffic"  # where the limit of the slow squares comes from
-
 
 PARAMETERS = "nav2_params.yaml"
 
@@ -75,26 +70,18 @@ class MaskCode(NamedTuple):
         return value
 
 
-NO_LIMITS = MaskCode.of({})
+class TrafficZone(NamedTuple):
+    """A zone of the squares that were crossed at least so often; its polygons do not count."""
+
+    least: int
+    zone: Zone
 
 
-class TrafficRule(NamedTuple):
-    """Zones from traffic: the squares that were crossed at least so often.
-
-    Attributes:
-        keepout: crossings from which a square is a keep-out zone; None: none is.
-        slow: crossings from which the speed in a square is limited; None: it is not.
-        limit: of the slow squares.
-    """
-
-    keepout: int | None
-    slow: int | None
-    limit: SpeedLimit
-
-
-@dataclass(eq=False)
 class Maps:
-    """A map and its masks.
+    """An edited copy of a map, and its masks: zones from traffic, then the others in order.
+
+    `erase` makes cells free in the map and removes zones there, `block` makes them occupied and
+    keeps out of them, `keepout` only keeps out of them, `speed` limits the speed.
 
     Attributes:
         map: the edited map, (H, W) cells.
@@ -104,65 +91,73 @@ class Maps:
         warnings: zones that are not as they were drawn, a sentence each.
     """
 
-    map: Grid
-    keepout: Mask | None = None
-    speed: NDArray[np.uint8] | None = None
-    code: MaskCode = NO_LIMITS
-    warnings: list[str] = field(default_factory=list)
+    def __init__(
+        self,
+        grid: Grid,
+        traffic: Sequence[TrafficZone],
+        crossings: Crossings | None,
+        zones: Sequence[Zone],
+    ) -> None:
+        """Draw the zones.
+
+        Args:
+            grid: the map.
+            traffic: zones from crossings.
+            crossings: None only where there are no such zones.
+            zones: a later one replaces earlier ones where they overlap.
+
+        Raises:
+            InputError: a zone holds no cell, limits are in percent and in m/s, or the map is
+                turned.
+        """
+        if grid.origin[2] != 0.0:
+            raise InputError("is a turned map: costmaps of nav2 have no orientation")
+        every, shape = [*zones, *(one.zone for one in traffic)], grid.p_occupied.shape
+        limits = {zone.where: zone.limit for zone in every if zone.limit is not None}
+        is_kept_out = any(zone.action in ("block", "keepout") for zone in every)
+        self.map = Grid(grid.p_occupied.copy(), grid.origin, grid.resolution)
+        self.keepout = np.zeros(shape, bool) if is_kept_out else None
+        self.speed = np.zeros(shape, np.uint8) if limits else None
+        self.code, self.warnings = MaskCode.of(limits), list[str]()
+        for least, zone in traffic if crossings is not None else ():
+            cells = _cells_of_squares(crossings.number >= least, crossings, grid)
+            if not cells.any():
+                most = int(crossings.number.max(initial=0))
+                what = f"no square of the floor was crossed {least} times, at most {most}"
+                kind = "keep-out" if zone.action == "keepout" else "slow"
+                self.warnings.append(f"{what}: traffic makes no {kind} zones")
+            self._edit(zone, cells)
+        for zone in zones:
+            self._add(zone)
+
+    def _add(self, zone: Zone) -> None:
+        cells = np.zeros(self.map.p_occupied.shape, bool)
+        for polygon in zone.polygons:
+            window, inside = cells_inside(polygon, self.map)
+            cells[window] |= inside
+        if not cells.any():
+            hint = f"the map: {_extent(self.map)}"
+            raise InputError("holds no cell of the map", where=zone.where, hint=hint)
+        if not all(is_within(polygon, self.map) for polygon in zone.polygons):
+            self.warnings.append(f"{zone.where} reaches beyond the map: only the part on it counts")
+        self._edit(zone, cells)
+
+    def _edit(self, zone: Zone, cells: Bool) -> None:
+        """Do with cells (H, W) what a zone says."""
+        if zone.action in ("erase", "block"):
+            self.map.p_occupied[cells] = float(zone.action == "block")
+        if self.keepout is not None and zone.action != "speed":
+            self.keepout[cells] = zone.action != "erase"
+        if self.speed is not None and zone.action in ("erase", "speed"):
+            limit = zone.limit
+            self.speed[cells] = 0 if limit is None else self.code.encode(limit, zone.where)
 
     def area(self, mask: NDArray[Any]) -> float:
         """m2 of the cells of a mask that are not 0."""
         return int(np.count_nonzero(mask)) * self.map.resolution**2
 
 
-def make_maps(
-    grid: Grid, zones: Sequence[Zone], rule: TrafficRule, crossings: Crossings | None
-) -> Maps:
-    """Edit a copy of a map, and draw the masks: zones from traffic, then the others in order.
-
-    `erase` makes cells free in the map and removes zones there, `block` makes them occupied and
-    keeps out of them, `keepout` only keeps out of them, `speed` limits the speed.
-
-    Args:
-        grid: the map.
-        zones: a later one replaces earlier ones where they overlap.
-        rule: which crossings make zones.
-        crossings: None only where the rule has no zones.
-
-    Raises:
-        InputError: a zone holds no cell, limits are in percent and in m/s, or the map is turned.
-    """
-    if grid.origin[2] != 0.0:
-        raise InputError("is a turned map: costmaps of nav2 have no orientation")
-    limits = {zone.where: zone.limit for zone in zones if zone.limit is not None}
-    if rule.slow is not None:
-        limits[_TRAFFIC] = rule.limit
-    maps = Maps(
-        Grid(grid.p_occupied.copy(), grid.origin, grid.resolution), code=MaskCode.of(limits)
-    )
-    shape = grid.p_occupied.shape
-    if rule.keepout is not None or any(one.action in ("block", "keepout") for one in zones):
-        maps.keepout = np.zeros(shape, bool)
-    if limits:
-        maps.speed = np.zeros(shape, np.uint8)
-    traffic: list[tuple[int | None, Action, SpeedLimit | None, str]] = [
-        (rule.keepout, "keepout", None, "keep-out"),
-        (rule.slow, "speed", rule.limit, "slow"),
-    ]
-    for least, action, limit, kind in traffic:
-        if least is not None and crossings is not None:
-            cells = _cells_of_squares(crossings.number >= least, crossings, grid)
-            if not cells.any():
-                most = int(crossings.number.max(initial=0))
-                what = f"no square of the floor was crossed {least} times, at most {most}"
-                maps.warnings.append(f"{what}: traffic makes no {kind} zones")
-            _edit(maps, Zone(_TRAFFIC, action, limit, []), cells)
-    for zone in zones:
-        _add_zone(maps, zone)
-    return maps
-
-
-def _cells_of_squares(squares: Mask, crossings: Crossings, grid: Grid) -> Mask:
+def _cells_of_squares(squares: Bool, crossings: Crossings, grid: Grid) -> Bool:
     """(H, W) cells of the map whose centres lie in squares that are true."""
     inside, index = [], []
     for axis, cells, n in zip((1, 0), grid.p_occupied.shape, squares.shape, strict=True):
@@ -173,30 +168,6 @@ def _cells_of_squares(squares: Mask, crossings: Crossings, grid: Grid) -> Mask:
     if not squares.size:
         return np.zeros(grid.p_occupied.shape, bool)
     return np.asarray(squares[np.ix_(*index)] & inside[0][:, None] & inside[1])
-
-
-def _add_zone(maps: Maps, zone: Zone) -> None:
-    cells = np.zeros(maps.map.p_occupied.shape, bool)
-    for polygon in zone.polygons:
-        window, inside = cells_inside(polygon, maps.map)
-        cells[window] |= inside
-    if not cells.any():
-        hint = f"the map: {_extent(maps.map)}"
-        raise InputError("holds no cell of the map", where=zone.where, hint=hint)
-    if not all(is_within(polygon, maps.map) for polygon in zone.polygons):
-        maps.warnings.append(f"{zone.where} reaches beyond the map: only the part on it counts")
-    _edit(maps, zone, cells)
-
-
-def _edit(maps: Maps, zone: Zone, cells: Mask) -> None:
-    """Do with cells (H, W) what a zone says."""
-    if zone.action in ("erase", "block"):
-        maps.map.p_occupied[cells] = float(zone.action == "block")
-    if maps.keepout is not None and zone.action != "speed":
-        maps.keepout[cells] = zone.action != "erase"
-    if maps.speed is not None and zone.action in ("erase", "speed"):
-        limit = zone.limit
-        maps.speed[cells] = 0 if limit is None else maps.code.encode(limit, zone.where)
 
 
 def _extent(grid: Grid) -> str:

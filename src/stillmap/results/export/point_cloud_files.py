@@ -1,7 +1,6 @@
 """Write a point cloud with `p_static` and colors as PLY, PCD, LAS, LAZ, E57 or text."""
 
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,19 +8,11 @@ import numpy as np
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
-from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE, open_las_writer
+from stillmap.io.point_cloud import las, pcd, ply
+from stillmap.io.point_cloud.table import Fields
+from stillmap.results import point_cloud
 from stillmap.results.export import e57
-from stillmap.results.point_cloud import (
-    COLOURS,
-    FIELDS,
-    PACKED_COLOUR,
-    Block,
-    Cloud,
-    Fields,
-    cloud_fields,
-    make_vertices,
-    ply_header,
-)
+from stillmap.results.point_cloud import Block, Cloud, make_vertices
 
 Progress = Callable[[float], None]
 
@@ -91,28 +82,13 @@ def write(cloud: Cloud, path: Path, file_format: Format, progress: Progress | No
 
 
 def _write_ply(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = cloud_fields(cloud, COLOURS)
-    _write_records(cloud, path, ply_header(fields, cloud.count), fields, progress)
+    fields = point_cloud.cloud_fields(cloud, point_cloud.COLOURS)
+    _write_records(cloud, path, ply.make_header(fields, cloud.count), fields, progress)
 
 
 def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = cloud_fields(cloud, PACKED_COLOUR)
-    names = [name for name, _ in fields]
-    lines = (
-        "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
-        f"FIELDS {' '.join(names)}",
-        f"SIZE {' '.join(kind[-1] for _, kind in fields)}",
-        f"TYPE {' '.join('F' for _ in names)}",  # of packed colours too, by convention of PCL
-        f"COUNT {' '.join('1' for _ in names)}",
-        f"WIDTH {cloud.count}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {cloud.count}",
-        "DATA binary",
-    )
-    header = "".join(f"{line}\n" for line in lines).encode()
-    _write_records(cloud, path, header, fields, progress)
+    fields = point_cloud.cloud_fields(cloud, point_cloud.PACKED_COLOUR)
+    _write_records(cloud, path, pcd.make_header(fields, cloud.count, np.eye(4)), fields, progress)
 
 
 def _write_records(
@@ -125,7 +101,12 @@ def _write_records(
 
 
 def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    names = [name for name, _ in (FIELDS + COLOURS if cloud.has_colors else FIELDS)]
+    names = [
+        name
+        for name, _ in (
+            point_cloud.FIELDS + point_cloud.COLOURS if cloud.has_colors else point_cloud.FIELDS
+        )
+    ]
     line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.has_colors else "") + "\n"
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")
@@ -138,20 +119,16 @@ def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) ->
 def _write_las(cloud: Cloud, path: Path, compressed: bool, progress: Progress | None) -> None:
     laspy = import_extra("laspy", path, "written")
     kind = _COLOR_POINT_FORMAT if cloud.has_colors else _POINT_FORMAT
-    header = laspy.LasHeader(point_format=kind, version="1.4")
-    header.scales, header.offsets = np.full(3, SCALE), cloud.origin
+    header = las.make_header(laspy, kind, "1.4", cloud.origin)
     header.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
     header.global_encoding.wkt = True  # required by LAS 1.4, even without a coordinate system
-    header.generating_software = "stillmap"
-    # a fixed date, so that the file is reproducible
-    header.creation_date = date(1970, 1, 1)
-    with open_las_writer(path, laspy, header, compressed) as writer:
+    with las.open_las_writer(path, laspy, header, compressed) as writer:
         for block in cloud.iter_blocks(progress):
             writer.write_points(_las_points(laspy, header, block))
 
 
 def _las_points(laspy: Any, header: Any, block: Block) -> Any:
-    if np.abs(block.points - header.offsets).max(initial=0.0) >= MAX_INTEGER * SCALE:
+    if np.abs(block.points - header.offsets).max(initial=0.0) >= las.MAX_INTEGER * las.SCALE:
         raise InputError("cannot be written: a point is beyond the range of LAS coordinates")
     out = laspy.ScaleAwarePointRecord.zeros(len(block.points), header=header)
     out.x, out.y, out.z = block.points.T

@@ -9,15 +9,13 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from stillmap.core.array_folder import parse
+from stillmap.core.array_types import Bool, Float
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Action = Literal["erase", "block", "keepout", "speed"]
 Polygon = list[Float]  # rings (n, 2), the last position equal to the first: outline, then holes
 
@@ -138,7 +136,7 @@ def _read_zone(content: dict[str, Any], where: Path) -> Zone:
     return Zone(str(where), properties.action, limit, polygons)
 
 
-def cells_inside(polygon: Sequence[Float], grid: GridMap) -> tuple[tuple[slice, slice], Mask]:
+def cells_inside(polygon: Sequence[Float], grid: GridMap) -> tuple[tuple[slice, slice], Bool]:
     """The cells of a map whose centres lie inside a polygon.
 
     Args:
@@ -168,7 +166,7 @@ def is_within(polygon: Sequence[Float], grid: GridMap) -> bool:
     return bool((outline >= -1e-6).all() and (beyond <= 1e-6).all())
 
 
-def _inside_ring(ring: Float, shape: tuple[int, int]) -> Mask:
+def _inside_ring(ring: Float, shape: tuple[int, int]) -> Bool:
     """Cells (h, w) whose centres lie inside a ring in cells, by the even-odd rule.
 
     Along a row, each edge that crosses the line through the centres changes inside to outside or

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import release, tiles_of
 from stillmap.pipeline.snapshots import Snapshot, Value, Window, cut_layer, extent
@@ -18,7 +19,6 @@ from stillmap.results.colors import ORANGE
 from stillmap.results.reader import OCCUPIED_THRESH
 
 Color = tuple[int, int, int]
-Mask = NDArray[np.bool_]
 UNKNOWN, VIOLET = (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
@@ -79,7 +79,7 @@ class MapView:
             + [f"M0 {(y1 - y) * height / (y1 - y0):.1f}h{width}" for y in rows]
         )
 
-    def to_pixels(self, points: NDArray[np.float32] | NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_pixels(self, points: Float32 | Float) -> Float:
         """Column and row (K, 2) in pixels from the top left of map points (K, 2) in m."""
         x0, y0, x1, y1 = self.window
         width, height = self.size
@@ -87,7 +87,7 @@ class MapView:
         row = (y1 - points[:, 1]) * (height / (y1 - y0))
         return np.stack([column, row], axis=1).astype(np.float64)
 
-    def svg_points(self, points: NDArray[np.float64]) -> str:
+    def svg_points(self, points: Float) -> str:
         """The `points` attribute of a polyline through map points (K, 2)."""
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in self.to_pixels(points).tolist())
 
@@ -146,9 +146,7 @@ def map_levels(
     return np.ascontiguousarray(np.concatenate(levels)[::-1])
 
 
-def draw_thinly_observed(
-    occupancy: GridMap, thin: NDArray[np.bool_], window: Window
-) -> Image.Image:
+def draw_thinly_observed(occupancy: GridMap, thin: Bool, window: Window) -> Image.Image:
     """Thinly observed cells (H, W) in violet, as a layer over the `draw_map` of the window."""
     factor, strips = reduction_factor(window, occupancy.resolution), []
     for cells, p in zip(
@@ -162,7 +160,7 @@ def draw_thinly_observed(
     return color_by_index(shown, (UNKNOWN, VIOLET), bytes([0, VEIL_ALPHA]))
 
 
-def draw_points(points: NDArray[np.float32] | NDArray[np.float64], view: MapView) -> Image.Image:
+def draw_points(points: Float32 | Float, view: MapView) -> Image.Image:
     """Orange dots on a transparent layer over the `draw_map` of a view."""
     pixels = np.zeros(view.size[::-1], np.uint8)
     _put_dots(pixels, view, points, 1, max(1, round(view.size[0] / _DOT_WIDTH)))
@@ -241,7 +239,7 @@ def iter_strips(
         release(layer)
 
 
-def count_in_squares(cells: Mask, factor: int) -> NDArray[np.int64]:
+def count_in_squares(cells: Bool, factor: int) -> Int64:
     """(h, w) number of true cells in squares of `factor` x `factor` cells."""
     return np.asarray(reduce_squares(np.add, cells, factor), np.int64)
 
@@ -252,7 +250,7 @@ def reduce_squares(ufunc: np.ufunc, cells: NDArray[Any], factor: int) -> NDArray
     return np.asarray(ufunc.reduceat(ufunc.reduceat(cells, rows, axis=0), columns, axis=1))
 
 
-def reduce_levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
+def reduce_levels(cells: Float32, factor: int) -> NDArray[np.uint8]:
     """Occupancy in percent of squares of `factor` x `factor` cells, 101 where unknown.
 
     The maximum where a cell is occupied, so that thin walls stay visible; else the mean of the

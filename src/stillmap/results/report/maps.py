@@ -2,43 +2,31 @@
 
 import math
 from collections import Counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float32
 from stillmap.core.grid_map import GridMap
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Snapshot, Window, extent
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.map_server import CHANGED, changed_cells, trinary_pixels
-from stillmap.results.report.figures import (
-    UNKNOWN_LEVEL,
-    MapView,
-    color_by_index,
-    count_in_squares,
-    data_uri,
-    draw_map,
-    draw_points,
-    draw_snapshot,
-    draw_thinly_observed,
-    iter_strips,
-    reduce_levels,
-    reduce_squares,
-)
-from stillmap.results.run_json import known_area
+from stillmap.results.report import figures
+from stillmap.results.report.figures import MapView, data_uri
+from stillmap.results.run_json import known_area, thin_area
 from stillmap.tracking import FlowMap
 from stillmap.tracking.objects import mean_speed, track_length
-
-if TYPE_CHECKING:
-    from stillmap.pipeline.tilting import TiltingResult
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # pixels of map.pgm
 _MAX_EDGE = 4096  # pixels; a trinary map of that size takes a few hundred kB as PNG
 # of occupancy in percent as `--map-mode scale` writes it, and of unknown cells
-_PERCENT_GREYS = [round(255 * (1 - percent / 100)) for percent in range(UNKNOWN_LEVEL)] + [UNKNOWN]
+_PERCENTS = range(figures.UNKNOWN_LEVEL)
+_PERCENT_GREYS = [*(round(255 * (1 - percent / 100)) for percent in _PERCENTS), UNKNOWN]
 _MAX_PATH_POINTS = 3000
 _MAX_ROWS, _MAX_TRACKS, _MAX_OBJECTS = 50, 500, 25  # shown of changes, tracks, rows of objects
 _TRAFFIC_COLORS = 64
@@ -74,25 +62,27 @@ def draw_written_map(occupancy: GridMap, mode: MapMode) -> WrittenMap:
     """
     height, width = occupancy.p_occupied.shape
     factor = max(1, math.ceil(max(height, width) / _MAX_EDGE))
-    strips = iter_strips(occupancy, occupancy.p_occupied, extent(occupancy), np.nan, factor)
-    reduce = _reduce_states if mode == "trinary" else reduce_levels
+    strips = figures.iter_strips(occupancy, occupancy.p_occupied, extent(occupancy), np.nan, factor)
+    reduce = _reduce_states if mode == "trinary" else figures.reduce_levels
     pixels = np.concatenate([reduce(cells, factor) for cells in strips])[::-1]
     x0, y0, _, _ = extent(occupancy)
     edge = factor * occupancy.resolution
     window = (x0, y0, x0 + pixels.shape[1] * edge, y0 + pixels.shape[0] * edge)
     greys = (OCCUPIED, UNKNOWN, FREE) if mode == "trinary" else _PERCENT_GREYS
-    return WrittenMap(color_by_index(pixels, ((grey,) * 3 for grey in greys)), window, factor)
+    return WrittenMap(
+        figures.color_by_index(pixels, ((grey,) * 3 for grey in greys)), window, factor
+    )
 
 
-def _reduce_states(p_occupied: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
+def _reduce_states(p_occupied: Float32, factor: int) -> NDArray[np.uint8]:
     """0: a cell of the square is occupied, 2: at least half of its known cells are free, else 1."""
     states = trinary_pixels(p_occupied)
     occupied, free = states == OCCUPIED, states == FREE
     if factor > 1:
         n_free, n_known = (
-            count_in_squares(cells, factor) for cells in (free, ~np.isnan(p_occupied))
+            figures.count_in_squares(cells, factor) for cells in (free, ~np.isnan(p_occupied))
         )
-        occupied = count_in_squares(occupied, factor) > 0
+        occupied = figures.count_in_squares(occupied, factor) > 0
         free = (n_free > 0) & (2 * n_free >= n_known)
     return np.where(occupied, 0, np.where(free, 2, 1)).astype(np.uint8)
 
@@ -102,31 +92,31 @@ def draw_filtered_map(result: MappingResult) -> tuple[MapView, Image.Image] | No
     if not result.map.p_occupied.size:
         return None
     view = MapView.of([result.raw_map, result.map])
-    return view, draw_map(result.map, view.window)
+    return view, figures.draw_map(result.map, view.window)
 
 
 def map_data(result: MappingResult, view: MapView, filtered: Image.Image) -> dict[str, Any]:
     """The map as written, and the raw one beside the filtered one (Figs. 4, 6, 7)."""
-    thin, area = result.evidence.thinly_observed, known_area(result)
+    thin = result.evidence.thinly_observed
     every = max(1, math.ceil(len(result.poses) / _MAX_PATH_POINTS))
     return {
         **written_map_data(result.map, result.options.output.map_mode, view),
-        "raw": data_uri(draw_map(result.raw_map, view.window)),
+        "raw": data_uri(figures.draw_map(result.raw_map, view.window)),
         "filtered": data_uri(filtered),
         "dynamic": draw_dynamic(result, view),
-        "thinly_observed": data_uri(draw_thinly_observed(result.map, thin, view.window)),
+        "thinly_observed": data_uri(figures.draw_thinly_observed(result.map, thin, view.window)),
         "path": view.svg_points(result.poses[::every, :2, -1]),
-        "known_area": area["known"],
-        "thinly_observed_area": area["thin"],
+        "known_area": known_area(result.map),
+        "thinly_observed_area": thin_area(result),
         "min_observations": result.evidence.min_observations,
         "radius": result.evidence.mover_radius,
     }
 
 
-def draw_dynamic(result: "MappingResult | TiltingResult", view: MapView) -> str:
+def draw_dynamic(result: MappingResult | TiltingResult, view: MapView) -> str:
     """`data:` URI of the dynamic returns as a layer over the map."""
     ends = sample_points(result.deskewed, result.poses, result.p_static)[:, :2]
-    return data_uri(draw_points(ends, view))
+    return data_uri(figures.draw_points(ends, view))
 
 
 def written_map_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
@@ -162,11 +152,11 @@ def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
     """The changed cells in the colors of their kinds, transparent elsewhere."""
     codes: Any = changed_cells(result.map, result.changes)  # may be tiled
     strips = [
-        reduce_squares(np.maximum, cells, view.factor)
-        for cells in iter_strips(result.map, codes, view.window, 0, view.factor)
+        figures.reduce_squares(np.maximum, cells, view.factor)
+        for cells in figures.iter_strips(result.map, codes, view.window, 0, view.factor)
     ]
     colors = ((255, 255, 255), *(_COLORS[kind] for kind in CHANGED))
-    return color_by_index(np.concatenate(strips)[::-1], colors, 0)
+    return figures.color_by_index(np.concatenate(strips)[::-1], colors, 0)
 
 
 def objects_data(
@@ -223,7 +213,7 @@ def evolution_data(result: MappingResult) -> list[tuple[Snapshot, MapView, str]]
     """The part of the map with most dynamic returns over the iterations (Fig. 8): of each what was
     seen, its view, and the `data:` URI of its picture."""
     shown = [one for one in result.snapshots if one.p_occupied.size]
-    pictures = map(draw_snapshot, shown)
+    pictures = map(figures.draw_snapshot, shown)
     return [
         (one, MapView(extent(one), picture.size), data_uri(picture))
         for one, picture in zip(shown, pictures, strict=True)

@@ -4,28 +4,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.core.config import iter_options
-from stillmap.core.errors import split_advice
-from stillmap.core.json import to_jsonable
+from stillmap.core import config, errors, json
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.report.estimation import calibration_data, convergence_data
-from stillmap.results.report.maps import (
-    changes_data,
-    draw_dynamic,
-    draw_filtered_map,
-    evolution_data,
-    map_data,
-    objects_data,
-)
-from stillmap.results.report.point_view import points_data
-from stillmap.results.report.template import render_page
+from stillmap.pipeline.tilting import TiltingResult
+from stillmap.results.report import estimation, maps, point_view, template
 from stillmap.results.run_json import models_record, tilting_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.tilting import TiltingResult
 
 # files beside the report that are linked where they exist, with their content
 _FILES = {
@@ -48,7 +36,7 @@ _NO_MORE: Mapping[str, str] = {}
 
 def render_report(
     result: MappingResult,
-    tilting: "TiltingResult | None" = None,
+    tilting: TiltingResult | None = None,
     models: "Models | None" = None,
     folder: Path | None = None,
 ) -> str:
@@ -60,31 +48,31 @@ def render_report(
         models: of the place and of moving objects.
         folder: the result folder, to whose files the page links; None: no links.
     """
-    figure, recording = draw_filtered_map(result), result.recording
-    findings = [split_advice(text) for text in result.warnings]
+    figure, recording = maps.draw_filtered_map(result), result.recording
+    findings = [errors.split_advice(text) for text in result.warnings]
     data = {
         "result": result,
         "title": Path(recording.source.path or "").name or "recording",
-        "source": to_jsonable(recording.source.to_dict()),
-        "beams": count_beams(recording, result.p_static),
+        "source": json.to_jsonable(recording.source.to_dict()),
+        "beams": count_beams(recording.hit, result.p_static),
         "seconds": 1e-9 * float(recording.stamp_ns[-1] - recording.stamp_ns[0]),
         "warnings": [(what, todo) for what, todo in findings if todo],
         "notes": [what for what, todo in findings if not todo],
         "quality": describe_quality(result.quality),
         "files": files_data(folder),
-        "maps": figure and map_data(result, *figure),
-        "changes": figure and changes_data(result, figure[0]),
-        "objects": figure and objects_data(result, *figure),
-        "points": points_data(result, tilting),
+        "maps": figure and maps.map_data(result, *figure),
+        "changes": figure and maps.changes_data(result, figure[0]),
+        "objects": figure and maps.objects_data(result, *figure),
+        "points": point_view.points_data(result, tilting),
         "rig": None if tilting is None else tilting_record(tilting),
-        "rig_dynamic": figure and tilting and draw_dynamic(tilting, figure[0]),
+        "rig_dynamic": figure and tilting and maps.draw_dynamic(tilting, figure[0]),
         "models": None if models is None else models_record(models),
-        "calibration": calibration_data(result),
-        "convergence": convergence_data(result),
-        "evolution": evolution_data(result),
-        "options": [(one.name, one.value) for one in iter_options(result.options)],
+        "calibration": estimation.calibration_data(result),
+        "convergence": estimation.convergence_data(result),
+        "evolution": maps.evolution_data(result),
+        "options": [(one.name, one.value) for one in config.iter_options(result.options)],
     }
-    return render_page(data)
+    return template.render_page(data)
 
 
 def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[tuple[str, str]]:

@@ -10,21 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float
 from stillmap.core.grid_map import GridMap
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.snapshots import Window, extent
 from stillmap.results.colors import KIND_COLORS, color_by_id
-from stillmap.results.report.figures import (
-    MAX_PIXELS,
-    UNKNOWN_LEVEL,
-    MapView,
-    color_levels,
-    data_uri,
-    map_levels,
-    map_window,
-    reduction_factor,
-)
+from stillmap.results.report import figures
+from stillmap.results.report.figures import MapView, data_uri
 from stillmap.results.report.maps import written_map_data
 from stillmap.results.report.page import files_data
 from stillmap.results.report.template import render_page
@@ -36,8 +29,6 @@ from stillmap.results.timeline import (
     format_date_time,
     read_timeline,
 )
-
-Float = NDArray[np.float64]
 
 _MAX_PATH_POINTS = 1000  # of a session
 _THUMBNAIL_PIXELS = 60_000  # 300 x 200, about 5 kB as PNG
@@ -59,7 +50,7 @@ _FILES = {
 _FONT_SHARE, _PAD_SHARE = 1 / 45, 1 / 160  # of the longer edge of the view
 _LABEL_SHARE = 0.06  # of the width, which a label takes at most
 _OCCUPIED_LEVEL = 100
-_CAME, _LEFT, _CLEAR = UNKNOWN_LEVEL + 2, UNKNOWN_LEVEL + 3, UNKNOWN_LEVEL + 4
+_CAME, _LEFT, _CLEAR = (figures.UNKNOWN_LEVEL + k for k in (2, 3, 4))
 _MARGIN = 8  # cells around changed cells that a picture shows at least
 
 
@@ -77,17 +68,24 @@ def render_place_report(
     Raises:
         InputError: a file of the place is damaged.
     """
-    timeline = read_timeline(folder, str(record["place"]["map_state"]))
+    timeline = read_timeline(folder)
     numbers = range(len(timeline.sessions))
-    pictures = small = None
+    pictures = small = maps = None
     if occupancy.p_occupied.size:
         pictures = PlacePictures(occupancy, timeline)
         small = PlacePictures(occupancy, timeline, _THUMBNAIL_PIXELS)
+        view, sessions = pictures.view, enumerate(timeline.sessions)
+        maps = {
+            **written_map_data(occupancy, mode, view),
+            "base": data_uri(pictures.draw_map()),
+            "font_size": max(view.size) * _FONT_SHARE,
+            "paths": [_path_data(folder, one, k, view) for k, one in sessions],
+        }
     data = {
         "title": f"{len(timeline.sessions)} sessions of a place",
         "place": record,
         "timeline": timeline,
-        "maps": pictures and _map_data(folder, timeline, occupancy, mode, pictures),
+        "maps": maps,
         "thumbnails": [small and (small.view, data_uri(small.draw(k))) for k in numbers],
         "steps": [_step_data(timeline, k, pictures) for k in numbers[1:]],
         "max_rows": _MAX_ROWS,
@@ -117,27 +115,10 @@ def _heading(T: Float) -> float:
     return round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0
 
 
-def _map_data(
-    folder: Path,
-    timeline: Timeline,
-    occupancy: GridMap,
-    mode: MapMode,
-    pictures: "PlacePictures",
-) -> dict[str, Any]:
-    """The map as written with the trajectories."""
-    view = pictures.view
-    return {
-        **written_map_data(occupancy, mode, view),
-        "base": data_uri(pictures.draw_map()),
-        "font_size": max(view.size) * _FONT_SHARE,
-        "paths": [_path_data(folder, one, k, view) for k, one in enumerate(timeline.sessions)],
-    }
-
-
 def _path_data(folder: Path, one: PlaceSession, number: int, view: MapView) -> dict[str, Any]:
     _, poses = read_tum(folder / "sessions" / one.name / "trajectory.tum")
     every = max(1, math.ceil(len(poses) / _MAX_PATH_POINTS))
-    points: NDArray[np.float64] = poses[::every, :2, 3]
+    points: Float = poses[::every, :2, 3]
     return {
         "points": view.svg_points(points),
         "start": view.to_pixels(points[:1])[0].tolist(),
@@ -182,7 +163,9 @@ class PlacePictures:
         view: window and size of the pictures.
     """
 
-    def __init__(self, occupancy: GridMap, timeline: Timeline, max_pixels: int = MAX_PIXELS):
+    def __init__(
+        self, occupancy: GridMap, timeline: Timeline, max_pixels: int = figures.MAX_PIXELS
+    ):
         """Draw the map as it was written.
 
         Args:
@@ -192,11 +175,11 @@ class PlacePictures:
         """
         cells, self._timeline = timeline.cells, timeline
         window = _window_of(occupancy, timeline)
-        factor = reduction_factor(window, occupancy.resolution, max_pixels)
+        factor = figures.reduction_factor(window, occupancy.resolution, max_pixels)
         at = np.floor((cells.centers - np.array(window[:2])) / occupancy.resolution)
         local = at.astype(np.int64)
-        self._levels = map_levels(occupancy, window, max_pixels=max_pixels)
-        self._cleared = map_levels(occupancy, window, local, max_pixels)
+        self._levels = figures.map_levels(occupancy, window, max_pixels=max_pixels)
+        self._cleared = figures.map_levels(occupancy, window, local, max_pixels)
         height, width = self._levels.shape
         self.view = MapView(window, (width, height), factor)
         row, column = height - 1 - local[:, 1] // factor, local[:, 0] // factor
@@ -206,12 +189,12 @@ class PlacePictures:
 
     def draw_map(self) -> Image.Image:
         """The map as it was written."""
-        return color_levels(self._levels)
+        return figures.color_levels(self._levels)
 
     def draw(self, session: int) -> Image.Image:
         """The map as of a session, in color what came and left since the one before."""
         colors = KIND_COLORS["appeared"], KIND_COLORS["gone"]
-        return color_levels(self._levels_as_of(session), *colors)
+        return figures.color_levels(self._levels_as_of(session), *colors)
 
     def draw_difference(self, session: int) -> tuple[int, int, Image.Image] | None:
         """The difference of `draw` of a session from `draw_map`, transparent elsewhere, after
@@ -223,7 +206,9 @@ class PlacePictures:
         rows, columns = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))
         part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         pixels = np.where(differs, levels, np.uint8(_CLEAR))[part]
-        image = color_levels(pixels, KIND_COLORS["appeared"], KIND_COLORS["gone"], (0, 0, 0))
+        image = figures.color_levels(
+            pixels, KIND_COLORS["appeared"], KIND_COLORS["gone"], (0, 0, 0)
+        )
         image.info["transparency"] = _CLEAR
         return int(columns[0]), int(rows[0]), image
 
@@ -245,7 +230,7 @@ class PlacePictures:
 
 def _window_of(occupancy: GridMap, timeline: Timeline) -> Window:
     """The window of the map, widened by changed cells at its border."""
-    x0, y0, x1, y1 = map_window([occupancy])
+    x0, y0, x1, y1 = figures.map_window([occupancy])
     cells, whole = timeline.cells, extent(occupancy)
     if not len(cells.cells):
         return x0, y0, x1, y1

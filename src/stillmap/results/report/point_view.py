@@ -1,22 +1,18 @@
 """The points of a 3D result in perspective: static ones by height, dynamic ones in orange."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float, Float32
 from stillmap.mapping.beam_statistics import sample_points
 from stillmap.pipeline.result import MappingResult
+from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.colors import ORANGE, color_by_height
 from stillmap.results.report.figures import data_uri
-
-if TYPE_CHECKING:
-    from stillmap.pipeline.tilting import TiltingResult
-
-Float = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 _SIZE = (1280, 720)  # pixels
 _CENTER = 0.5 * np.array(_SIZE) - 0.5  # pixel centers have integer coordinates
@@ -37,7 +33,7 @@ _MARGIN = 1.05  # around fitted points
 
 
 def points_data(
-    result: MappingResult, tilting: "TiltingResult | None" = None
+    result: MappingResult, tilting: TiltingResult | None = None
 ) -> dict[str, Any] | None:
     """The static points, and the same with dynamic ones, as seen from above and aside.
 
@@ -74,7 +70,7 @@ def points_data(
     }
 
 
-def find_ceiling(z: NDArray[np.float32], base: float) -> float:
+def find_ceiling(z: Float32, base: float) -> float:
     """Lowest height of the ceiling in m; inf: there is none.
 
     Walls have no more points at their top than below, a ceiling has many.
@@ -93,7 +89,7 @@ def find_ceiling(z: NDArray[np.float32], base: float) -> float:
     return float(edges[1]) if above > _CEILING_DENSITY * walls else math.inf
 
 
-def draw_points_3d(points: Points, colors: NDArray[np.uint8], T_camera_map: Float) -> Image.Image:
+def draw_points_3d(points: Float32, colors: NDArray[np.uint8], T_camera_map: Float) -> Image.Image:
     """Points (n, 3) in colors (n, 3) over a dark background; nearer ones hide those behind."""
     width, height = _SIZE
     local = points @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
@@ -117,7 +113,7 @@ def draw_points_3d(points: Points, colors: NDArray[np.uint8], T_camera_map: Floa
     return Image.fromarray(pixels)
 
 
-def _choose_view(points: Points) -> Float:
+def _choose_view(points: Float32) -> Float:
     """T_camera_map (4, 4) from above and aside of the longer side of the place."""
     some = points[:: -(-len(points) // _MAX_FITTED)].astype(np.float64)
     low, high = np.quantile(some, [_OUTLIERS, 1.0 - _OUTLIERS], axis=0)

@@ -6,18 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import sample_indices
 from stillmap.mesh.texture import GRAY
+from stillmap.results import colors as palette
 from stillmap.results import gltf
-from stillmap.results.colors import (
-    BACKGROUND,
-    BLUE,
-    ORANGE,
-    TEAL,
-    color_by_height,
-    color_by_p_static,
-    color_static,
-)
 from stillmap.results.viewer.measuring import Ray, pick_plane, pick_point
 from stillmap.results.viewer.nodes import NO_SHADOWS, Nodes, node_path
 from stillmap.results.viewer.objects import ObjectNodes
@@ -78,7 +71,8 @@ class Layers:
             self.heights = low, high
             self.colorings = (LABEL, HEIGHT) + (PICTURES,) * (static.colors is not None)
         # light grey, so that white walls are visible
-        nodes.server.scene.set_background_image(np.array([[BACKGROUND]], np.uint8), format="png")
+        background = np.array([[palette.BACKGROUND]], np.uint8)
+        nodes.server.scene.set_background_image(background, format="png")
         self._make_all()
 
     def _make_all(self) -> None:
@@ -137,7 +131,7 @@ class Layers:
         for name, cloud in self.clouds.items():
             self._points[name][0].colors = self._cloud_colors(name, cloud, by)
 
-    def pick(self, ray: Ray, tangent: float) -> NDArray[np.float64] | None:
+    def pick(self, ray: Ray, tangent: float) -> Float | None:
         """The visible point (3,) that a ray meets, relative to the scene's origin; else the map's.
 
         Args:
@@ -176,12 +170,13 @@ class Layers:
         if by == PICTURES and cloud.colors is not None:
             colors = cloud.colors.copy()
             if name == DYNAMIC:  # grey where no picture shows them, which would look static
-                colors[(colors == GRAY).all(axis=1)] = ORANGE
+                colors[(colors == GRAY).all(axis=1)] = palette.ORANGE
             return colors
         if name == DYNAMIC:
-            return np.full((len(cloud.points), 3), ORANGE, np.uint8)
-        color = color_by_height if by == HEIGHT else color_static
-        return color(cloud.points[:, 2] + self._scene.origin[2], *self.heights)
+            return np.full((len(cloud.points), 3), palette.ORANGE, np.uint8)
+        z = cloud.points[:, 2] + self._scene.origin[2]
+        stops = palette.HEIGHT_COLORS if by == HEIGHT else palette.STATIC_COLORS
+        return palette.color_by_height(z, *self.heights, stops)
 
     @property
     def _map_height(self) -> float:
@@ -219,7 +214,7 @@ class Layers:
     def _make_trajectory(self) -> None:
         whole = slice(0, len(self._scene.poses))
         pieces = self._nodes.path_pieces(whole, 2, _MAX_TRAJECTORY_POINTS)
-        self._path = self._nodes.lines("Robot", pieces, BLUE, 2.5)
+        self._path = self._nodes.lines("Robot", pieces, palette.BLUE, 2.5)
         length = _AXES_SIZE * self._nodes.height
         self._robot = self._nodes.server.scene.add_frame(
             node_path("Robot", "robot"), axes_length=length, axes_radius=0.06 * length
@@ -231,7 +226,7 @@ class Layers:
         self._points["Beams"] = self._ends, self._ends.point_size
 
     def _make_rays(self) -> None:
-        self._ray = self._nodes.lines("Rays", np.zeros((1, 2, 3)), TEAL, 1.0)
+        self._ray = self._nodes.lines("Rays", np.zeros((1, 2, 3)), palette.TEAL, 1.0)
 
     def _draw_beams(self, scan: int) -> None:
         assert self._beams is not None
@@ -239,7 +234,7 @@ class Layers:
         ends = ends - self._nodes.origin(3)
         with self._nodes.server.atomic():
             self._ends.points = ends.astype(np.float32)
-            self._ends.colors = color_by_p_static(p_static)
+            self._ends.colors = palette.color_by_p_static(p_static)
         some = ends[sample_indices(len(ends), _MAX_RAYS)]
         begin = np.broadcast_to(sensor - self._scene.origin, some.shape)
         self._ray.points = np.stack([begin, some], axis=1).astype(np.float32)

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.results.viewer.nodes import Nodes, escape_markdown, node_path
-
-Float = NDArray[np.float64]
 
 _CLICK_RADIUS = 0.01  # of a click on a point, as a share of the height of the view
 _MARK_SIZE = 0.006  # of a clicked point, likewise

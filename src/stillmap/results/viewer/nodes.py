@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import sample_indices
+from stillmap.io.trajectory import quaternion_from_pose
 from stillmap.results.report.template import render_part
 from stillmap.results.viewer.scene import Scene
 from stillmap.results.viewer.server import Server
@@ -21,7 +22,6 @@ _EXTENT_QUANTILES = (0.03, 0.97)  # of the points, without far outliers
 _DIRECTION_3D = np.array([-0.45, -0.7, 0.62])  # from the scene to the camera
 _SCALE_3D = 0.95  # of the height: what lies behind the center appears smaller
 _MIN_EXTENT = 5.0  # m
-Float = NDArray[np.float64]
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 _LAYER_STEP = 0.02  # m between the map and what is drawn on it in 2D
 
@@ -123,7 +123,7 @@ class Nodes:
 
     def place(self, node: Any, T: Float) -> None:
         """Place a node at a pose (4, 4) in the map frame."""
-        node.wxyz, node.position = quaternions(T[:3, :3]), T[:3, 3] - self.scene.origin
+        node.wxyz, node.position = quaternion_from_pose(T), T[:3, 3] - self.scene.origin
 
 
 class Labels:
@@ -141,12 +141,6 @@ class Labels:
             label.visible = n < len(texts)
             if label.visible:
                 label.text, label.position = texts[n]
-
-
-def quaternions(R: Float) -> Float:
-    """Quaternions (..., 4), w first, of rotations (..., 3, 3)."""
-    xyzw = scipy.spatial.transform.Rotation.from_matrix(R).as_quat()
-    return np.asarray(np.roll(xyzw, 1, axis=-1))
 
 
 def node_path(layer: str, part: str = "") -> str:

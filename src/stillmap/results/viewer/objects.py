@@ -1,19 +1,19 @@
 """Moving objects as viser nodes: boxes, numbers, models, tracks and the one that is selected."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.core.arrays import sample_indices
+from stillmap.io.trajectory import quaternion_from_pose
 from stillmap.results.colors import color_by_id
 from stillmap.results.objects import interpolate_pose
 from stillmap.results.reader import Track
-from stillmap.results.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path, quaternions
+from stillmap.results.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path
 
-Float = NDArray[np.float64]
 # the unit cube: bits 0 to 2 of a corner are its side in x, y, z
 _CORNERS = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5
 _EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])
@@ -114,10 +114,6 @@ class ObjectNodes:
         if event.instance_index < len(drawn):
             self._on_click(drawn[event.instance_index])
 
-    def _click_model(self, number: int, _event: Any) -> None:
-        """Called by viser."""
-        self._on_click(number)
-
     def make_tracks(self) -> None:
         """Create the lines of whole tracks."""
         pieces, numbers = [np.zeros((0, 2, 3))], list[int]()
@@ -137,7 +133,7 @@ class ObjectNodes:
             path = node_path("Object models", f"{model.track.id:04d}")
             add = self._nodes.server.scene.add_glb
             node = add(path, model.data, visible=False, **NO_SHADOWS)
-            node.on_click(partial(self._click_model, model.track.id))
+            node.on_click(lambda _event, number=model.track.id: self._on_click(number))
             self._models.append(node)
 
     def update(self, stamp_ns: int, session: str, shown: Callable[[str], bool]) -> None:
@@ -179,7 +175,7 @@ class ObjectNodes:
         self._sides.visible = bool(len(T))
         if len(T):
             self._sides.batched_positions = (T[:, :3, 3] - self._nodes.origin(1)).astype(np.float32)
-            self._sides.batched_wxyzs = quaternions(T[:, :3, :3]).astype(np.float32)
+            self._sides.batched_wxyzs = quaternion_from_pose(T).astype(np.float32)
             self._sides.batched_scales = np.maximum(size, _MIN_THICKNESS).astype(np.float32)
             self._sides.batched_colors = color
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.array_types import Float, Float32
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
@@ -28,7 +29,6 @@ from stillmap.results.timeline import Timeline, read_timeline
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
 
-Float = NDArray[np.float64]
 MAX_POINTS: dict[Part, int] = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
 _MAX_MODELS = 256 << 20  # bytes of all object models
@@ -52,7 +52,7 @@ class Points(NamedTuple):
         colors: (n, 3) uint8; None where the file has none.
     """
 
-    points: NDArray[np.float32]
+    points: Float32
     colors: NDArray[np.uint8] | None
 
 
@@ -80,9 +80,8 @@ class Model(NamedTuple):
         return np.asarray(interpolate_pose(self.track, stamp_ns) @ self.T_track_gltf)
 
 
-@dataclass(frozen=True, eq=False)
 class Scene:
-    """A result of T scans, or a place.
+    """A result of T scans, or a place, read from its folder.
 
     Attributes:
         name: name of the recording.
@@ -96,70 +95,48 @@ class Scene:
         models: of the tracks that have one.
         origin: (3,) whole m in the map frame; everything is drawn relative to it.
         ground: height of the map image in m.
+        is_2d: whether there are neither clouds nor a surface.
         notes: what cannot be shown, and why.
         timeline: of a place; None: a single result.
         pictures: of the map of a place; None for an empty one.
     """
 
-    name: str
-    folder: str
-    stamp_ns: NDArray[np.int64]
-    poses: Float
-    map_image: MapImage | None
-    clouds: dict[str, Points]
-    tracks: list[Track]
-    surface: bytes | None
-    models: list[Model]
-    origin: Float
-    ground: float
-    is_2d: bool
-    notes: list[str] = field(default_factory=list)
+    surface: bytes | None = None
     timeline: Timeline | None = None
     pictures: PlacePictures | None = None
 
+    def __init__(self, folder: Path, recording: str = "") -> None:
+        """Read a result or a place; optional files may be missing, unusable models are noted.
 
-def read_scene(folder: Path, recording: str = "") -> Scene:
-    """Read a result folder or a place; optional files may be missing, unusable models are noted.
+        Args:
+            folder: the result, or the place.
+            recording: name of its recording; that of the folder where it is empty.
 
-    Args:
-        folder: the result, or the place.
-        recording: name of its recording; that of the folder where it is empty.
-
-    Raises:
-        InputError: map or trajectory are missing, or a file is damaged.
-    """
-    grid, timeline, pictures = read_grid(folder), None, None
-    stamp_ns, poses = read_tum(folder / "trajectory.tum")
-    if is_place(folder):
-        timeline = read_timeline(folder)
-        if any(one.scans.stop > len(poses) for one in timeline.sessions):
-            what = "is damaged: its scans are not those of the place"
-            raise InputError(what, where=str(folder / SESSIONS))
-        pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
-    # near the scene: far away float32 would lose millimeters
-    positions, notes = poses[:, :3, 3], list[str]()
-    origin: Float = np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0)))
-    clouds = _read_clouds(folder, origin, notes)
-    tracks, surface = read_tracks(folder / "objects" / "objects.json"), None
-    if (folder / "mesh.glb").exists():
-        surface = _read_or_note(notes, gltf.read_glb, folder / "mesh.glb", _MAX_MESH)
-    return Scene(
-        name=recording or folder.resolve().name,
-        folder=folder.resolve().name,
-        stamp_ns=stamp_ns,
-        poses=poses,
-        map_image=_map_image(grid, pictures, transparent=bool(clouds)),
-        clouds={name: one for name, one in clouds.items() if len(one.points)},
-        tracks=tracks,
-        surface=surface,
-        models=_read_models(folder / "objects", tracks, notes),
-        origin=origin,
-        ground=_ground(clouds.get("Static points"), poses, origin),
-        is_2d=not clouds and surface is None,
-        notes=notes,
-        timeline=timeline,
-        pictures=pictures,
-    )
+        Raises:
+            InputError: map or trajectory are missing, or a file is damaged.
+        """
+        grid, self.notes, self.folder = read_grid(folder), list[str](), folder.resolve().name
+        self.name = recording or self.folder
+        self.stamp_ns, self.poses = read_tum(folder / "trajectory.tum")
+        if is_place(folder):
+            self.timeline = read_timeline(folder)
+            if any(one.scans.stop > len(self.poses) for one in self.timeline.sessions):
+                what = "is damaged: its scans are not those of the place"
+                raise InputError(what, where=str(folder / SESSIONS))
+            self.pictures = PlacePictures(grid, self.timeline) if grid.p_occupied.size else None
+        # near the scene: far away float32 would lose millimeters
+        positions = self.poses[:, :3, 3]
+        self.origin: Float = np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0)))
+        clouds = _read_clouds(folder, self.origin, self.notes)
+        self.clouds = {name: one for name, one in clouds.items() if len(one.points)}
+        self.tracks = read_tracks(folder / "objects" / "objects.json")
+        if (folder / "mesh.glb").exists():
+            path = folder / "mesh.glb"
+            self.surface = _read_or_note(self.notes, gltf.read_glb, path, _MAX_MESH)
+        self.map_image = _map_image(grid, self.pictures, transparent=bool(clouds))
+        self.models = _read_models(folder / "objects", self.tracks, self.notes)
+        self.ground = _ground(clouds.get("Static points"), self.poses, self.origin)
+        self.is_2d = not clouds and self.surface is None
 
 
 def _read_clouds(folder: Path, origin: Float, notes: list[str]) -> dict[str, Points]:
@@ -254,13 +231,11 @@ class Beams:
     """
 
     recording: Recording
-    p_static: NDArray[np.float32]
-    poses: NDArray[np.float64]
+    p_static: Float32
+    poses: Float
     slam: SlamOptions
 
-    def scan_view(
-        self, scan: int, max_count: int = MAX_BEAMS
-    ) -> tuple[Float, NDArray[np.float32], Float]:
+    def scan_view(self, scan: int, max_count: int = MAX_BEAMS) -> tuple[Float, Float32, Float]:
         """At most `max_count` returns of a scan; reads only this scan and its neighbors.
 
         Returns:
@@ -275,11 +250,9 @@ class Beams:
         beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
         use = np.flatnonzero(near.hit[at])
         use = use[sample_indices(len(use), max_count)]
-        T_map_sensor = near.T_map_sensor(self.poses[first:end])[scan - first]
         ends, origin = np.zeros((len(use), 3)), np.zeros(3)
-        points = near.points[at][use].astype(np.float64)
-        ends[:, :D] = points @ T_map_sensor[:D, :D].T + T_map_sensor[:D, D]
-        origin[:D] = T_map_sensor[:D, D]
+        ends[:, :D] = near.end_points(at.start + use, self.poses[first:end])
+        origin[:D] = near.T_map_sensor(self.poses[first:end])[scan - first, :D, D]
         p_static = np.asarray(self.p_static[beams][use])
         self.recording.release_pages(self.p_static)
         return ends, p_static, origin

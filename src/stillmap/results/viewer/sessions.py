@@ -3,14 +3,13 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Float
 from stillmap.results.colors import KIND_COLORS, color_by_id
 from stillmap.results.timeline import SessionChange, Timeline
 from stillmap.results.viewer.nodes import Labels, Nodes, escape_markdown, table_html
 from stillmap.results.viewer.objects import box_edges
 
-Float = NDArray[np.float64]
 _MAX_ROWS = 25
 _MAX_TRAJECTORY_POINTS = 20_000  # of all sessions together
 _MAX_LABELS = 100

@@ -7,8 +7,8 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.core.array_types import Int64
 from stillmap.results import colors
 from stillmap.results.report.figures import UNKNOWN
 from stillmap.results.report.template import render_part
@@ -130,7 +130,7 @@ class Window:
 
     def _show_scans(self, scans: slice) -> None:
         """Let the controls choose among these scans, and show the first one."""
-        self._stamp_ns: NDArray[np.int64] = self._scene.stamp_ns[scans]
+        self._stamp_ns: Int64 = self._scene.stamp_ns[scans]
         self._first = scans.start
         self._seconds = 1e-9 * (self._stamp_ns - self._stamp_ns[0])
         last = len(self._stamp_ns) - 1
