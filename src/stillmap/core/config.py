@@ -106,11 +106,13 @@ class Declaration(NamedTuple):
         return typing.get_args(self.kind) if is_choice else ()
 
 
-@cache
 def declared_options(kind: Any) -> dict[str, Declaration]:
     """The options of a class by name; sections are none, nor fields of a plain dataclass."""
-    if not issubclass(kind, CheckedOptions):
-        return {}
+    return _declare_all(kind) if issubclass(kind, CheckedOptions) else {}
+
+
+@cache
+def _declare_all(kind: type[CheckedOptions]) -> dict[str, Declaration]:
     hints = typing.get_type_hints(kind, include_extras=True)
     fields = [
         field for field in dataclasses.fields(kind) if not dataclasses.is_dataclass(field.default)

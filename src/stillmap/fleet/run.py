@@ -77,7 +77,7 @@ class Fleet(NamedTuple):
     @property
     def failed(self) -> int:
         """How many recordings and places failed."""
-        outcomes = [one.outcome for one in (*self.jobs, *self.places)]
+        outcomes = [job.outcome for job in self.jobs] + [place.outcome for place in self.places]
         return sum(outcome.status == "failed" for outcome in outcomes)
 
     def to_list(self) -> list[dict[str, Any]]:

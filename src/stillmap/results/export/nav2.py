@@ -119,14 +119,15 @@ class Maps:
         self.keepout = np.zeros(shape, bool) if is_kept_out else None
         self.speed = np.zeros(shape, np.uint8) if limits else None
         self.code, self.warnings = MaskCode.of(limits), list[str]()
-        for least, zone in traffic if crossings is not None else ():
-            cells = _cells_of_squares(crossings.number >= least, crossings, grid)
-            if not cells.any():
-                most = int(crossings.number.max(initial=0))
-                what = f"no square of the floor was crossed {least} times, at most {most}"
-                kind = "keep-out" if zone.action == "keepout" else "slow"
-                self.warnings.append(f"{what}: traffic makes no {kind} zones")
-            self._edit(zone, cells)
+        if crossings is not None:
+            for least, zone in traffic:
+                cells = _cells_of_squares(crossings.number >= least, crossings, grid)
+                if not cells.any():
+                    most = int(crossings.number.max(initial=0))
+                    what = f"no square of the floor was crossed {least} times, at most {most}"
+                    kind = "keep-out" if zone.action == "keepout" else "slow"
+                    self.warnings.append(f"{what}: traffic makes no {kind} zones")
+                self._edit(zone, cells)
         for zone in zones:
             self._add(zone)
 

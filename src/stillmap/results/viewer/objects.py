@@ -1,6 +1,7 @@
 """Moving objects as viser nodes: boxes, numbers, models, tracks and the one that is selected."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,10 @@ class ObjectNodes:
         if event.instance_index < len(drawn):
             self._on_click(drawn[event.instance_index])
 
+    def _click_model(self, number: int, _event: Any) -> None:
+        """Called by viser."""
+        self._on_click(number)
+
     def make_tracks(self) -> None:
         """Create the lines of whole tracks."""
         pieces, numbers = [np.zeros((0, 2, 3))], list[int]()
@@ -133,7 +138,7 @@ class ObjectNodes:
             path = node_path("Object models", f"{model.track.id:04d}")
             add = self._nodes.server.scene.add_glb
             node = add(path, model.data, visible=False, **NO_SHADOWS)
-            node.on_click(lambda _event, number=model.track.id: self._on_click(number))
+            node.on_click(partial(self._click_model, model.track.id))
             self._models.append(node)
 
     def update(self, stamp_ns: int, session: str, shown: Callable[[str], bool]) -> None:
