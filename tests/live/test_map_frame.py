@@ -48,7 +48,7 @@ def run():
     """A frame and labels after a correction; poses and anchors of all scans. Each scan sees a spot
     2 m ahead of it."""
     closer, labels = Closer(), CausalLabels(2, 0.05, EmOptions())
-    frame, odometry = MapFrame(2, closer, in_background=False), Odometry()
+    frame = MapFrame(2, labels, Odometry(), closer, in_background=False)
     poses, anchors = [], []
     for k in range(4 * 2 * CARRIED):
         if k == 4 * CARRIED + 2:  # not at a spaced scan
@@ -67,7 +67,7 @@ def run():
             since = np.arange(len(closer.poses)) > CARRIED
             moved = np.where(since[:, None, None], MOTION @ closer.poses, closer.poses)
             closer.found = Correction(MOTION, moved, [])
-        frame.correct(observation, added, labels, odometry)
+        frame.correct(observation, added)
     return frame, labels, np.array(poses), np.array(anchors)
 
 
@@ -127,9 +127,9 @@ def correct_in_parts(labels, scans):
         if scan is not None:
             labels.add(scan, scan.T)
             correction.note_labelled(scan)
-        is_done = correction.step(labels)
+        is_done = correction.step()
         blocks.append(correction._block)
-    correction.finish(labels)
+    correction.finish()
     return labels, blocks
 
 

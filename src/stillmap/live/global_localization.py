@@ -73,7 +73,7 @@ class GlobalLocalizer:
         self.is_ambiguous = False
         self._min_agree, self._sure_agree = min_agree, sure_agree
         self._gone_weight = gone_weight
-        self._known, self._surface = known, known.make_surface_map()
+        self._known, self._surface = known, to_surface_map(known.grid)
         self._last: Float | None = None
         self._times = 0  # that the last one was the best in a row
         self._first: SurfaceMap | None = None  # the view when it was for the first time
@@ -82,21 +82,11 @@ class GlobalLocalizer:
         """The view begins anew, in another frame."""
         self._last = None
 
-    def localize(self, view: GridMap, scan: Scan, pose: Float) -> Float | None:
+    def search(self, view: GridMap, refine: Callable[[Float], Float]) -> Float | None:
         """(3, 3) of a view in the known map; None: the evidence is not clear.
 
         Args:
             view: what was seen since the robot was lost, as a map in a frame of its own.
-            scan: the last scan.
-            pose: (3, 3) of the robot in the frame of the view.
-        """
-        return self.search(view, lambda T: self._refine(scan, T @ pose) @ se2.inverse(pose))
-
-    def search(self, view: GridMap, refine: Callable[[Float], Float]) -> Float | None:
-        """As `localize`.
-
-        Args:
-            view: as of `localize`.
             refine: a better alignment (3, 3) near the one given, which the search found.
         """
         self.is_ambiguous = False
@@ -153,7 +143,8 @@ class GlobalLocalizer:
     def _grid(self) -> _core.OccupancyGrid2D:
         return self._known.make_grid()
 
-    def _refine(self, scan: Scan, pose: Float) -> Float:
+    def register(self, scan: Scan, pose: Float) -> Float:
+        """(3, 3) T_map_base of a scan near a pose (3, 3)."""
         prior = motion_model.gaussian_prior(pose, *_STD)
         window = [2.0 * std for std in _STD]
         return scan_matching.search_pose(self._grid, scan, prior, *window).T_map_base
@@ -194,10 +185,15 @@ class PlanarLocalizer:
             scan: the last one; in 2D its hits.
             pose: (D+1, D+1) of the robot in the frame of the labels.
         """
-        if self._global is None:
+        known = self._global
+        if known is None:
             return None
-        T = self._global.localize(labels.to_map(is_seen_alone=True), scan, pose)
-        self.is_ambiguous = self._global.is_ambiguous
+
+        def refine(T: Float) -> Float:
+            return np.asarray(known.register(scan, T @ pose) @ se2.inverse(pose))
+
+        T = known.search(labels.to_map(is_seen_alone=True), refine)
+        self.is_ambiguous = known.is_ambiguous
         return T
 
     def forget(self, labels: CausalLabels) -> None:

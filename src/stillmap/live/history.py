@@ -38,8 +38,8 @@ class GrowingRecording:
         scratch: folder of files without a name; None: the system's.
 
     Attributes:
+        dimension, folder, scratch: see above.
         kept: number of scans that are there as a whole.
-        folder: see above.
 
     Raises:
         OSError: a file cannot be made.
@@ -53,7 +53,7 @@ class GrowingRecording:
         scratch: Path | None = None,
     ) -> None:
         D, pose = dimension, (dimension + 1,) * 2
-        self.folder, self._dimension, self._scratch = folder, dimension, scratch
+        self.folder, self.dimension, self.scratch = folder, dimension, scratch
         self.kept, self._count, self._beam_count = 0, 0, 0
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
@@ -141,7 +141,7 @@ class GrowingRecording:
         header = {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
-            "dimension": self._dimension,
+            "dimension": self.dimension,
             "scans": self.kept,
             "beams": self._beam_count,
             "sensors": len(self._mounts),
@@ -175,7 +175,7 @@ class GrowingRecording:
             T_odom_base=np.array(arrays["T_odom_base"]) if self._has_odometry else None,
             source=self._source(),
             beam_time=arrays["beam_time"] if self._has_times else None,
-            scratch=self._scratch,
+            scratch=self.scratch,
         )
 
     def notes(self) -> NDArray[Any]:
@@ -247,7 +247,7 @@ class History(GrowingRecording):
         except OSError as error:
             self._end(error.strerror or str(error))
             return
-        row_bytes = 9 + 4 * self._dimension
+        row_bytes = 9 + 4 * self.dimension
         if self._beam_count * row_bytes > self._max_bytes:
             self._end(f"{self._max_bytes / 1e9:g} GB of beams are kept")
 
@@ -255,7 +255,7 @@ class History(GrowingRecording):
         """Keep no more scans."""
         self._is_full = True
         self._drop_begun()
-        where = self.folder or self._scratch or "temporary files"
+        where = self.folder or self.scratch or "temporary files"
         _log.error("%s: %s: poses go on, but from here on no scan is kept", where, why)
 
     def move(self, folder: Path) -> None:

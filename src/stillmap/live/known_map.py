@@ -188,10 +188,6 @@ class KnownMap:
         _core.add_beams(grid, along, passed, np.ones(len(lengths), np.float32), every, poses)
         return grid
 
-    def make_surface_map(self) -> SurfaceMap:
-        """The map for the search of alignments."""
-        return to_surface_map(self.grid)
-
     def prime(self, labels: OccupancyFilter) -> None:
         """Tell the filters of cells what the map knows."""
         free = self.grid.centres(np.argwhere(self.grid.p_occupied < FREE_THRESH))

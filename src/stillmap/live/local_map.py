@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -184,14 +185,8 @@ class SpacedScans(GrowingRecording):
         Raises:
             OSError: the disk is full.
         """
-        self.append(
-            scan.beams,
-            scan.e,
-            poses=scan.T_map_base,
-            travelled=scan.travelled,
-            explained=explained,
-            drift=drift,
-        )
+        notes: dict[str, Any] = {"poses": scan.T_map_base, "travelled": scan.travelled}
+        self.append(scan.beams, scan.e, **notes, explained=explained, drift=drift)
 
     def context(self, keyframes: Index) -> LoopContext:
         """All scans so far, of which some are keyframes."""

@@ -58,19 +58,18 @@ class MapCorrection:
         poses: Float,
         tagged: Int64,
     ) -> None:
+        self._labels, self._D = labels, poses.shape[-1] - 1
         self.T_map_local, self.untied = correction.T_map_local, correction.untied
         self.count = len(correction.poses)  # of the spaced scans that were known
         self.poses = np.concatenate(
             [correction.poses, correction.T_map_local @ spaced[len(correction.poses) :]]
         )
-        self._D = poses.shape[-1] - 1
         # in 3D the local map moves with its frame: it holds what is near, not what loops tie to it
         self.local_map = LocalMap(labels.resolution) if self._D == 2 else None
         tagged = np.minimum(tagged, len(poses) - 1)
         self._motion = self.poses[tagged] @ se2.inverse(poses[tagged])
         self._source: OccupancyFilter = labels.filter
-        D = self._D
-        shift = np.linalg.norm((self.poses - poses)[:, :D, D], axis=1)
+        shift = np.linalg.norm((self.poses - poses)[:, : self._D, self._D], axis=1)
         self.is_small = is_small(poses, self.poses, self._motion[-1])
         self.moves_cells = bool(shift.max() > _MIN_SHIFT * labels.resolution)
         self.filter: OccupancyFilter = self._source.sibling() if self.moves_cells else self._source
@@ -90,8 +89,9 @@ class MapCorrection:
         """Tell of a scan that was added to the local map meanwhile."""
         self._scans.append(scan)
 
-    def step(self, labels: CausalLabels) -> bool:
+    def step(self) -> bool:
         """Do a part of the work; True when nothing is left."""
+        labels = self._labels
         if labels.tags > len(self._motion):  # scans that came meanwhile move as the last one
             more = labels.tags - len(self._motion)
             self._motion = np.concatenate([self._motion, self._motion[-1:].repeat(more, axis=0)])
@@ -108,10 +108,10 @@ class MapCorrection:
             labels.add(scan, self.T_map_local @ scan.T, self.filter)
         return not self._labelled
 
-    def finish(self, labels: CausalLabels) -> None:
+    def finish(self) -> None:
         """Replace the cells of the labels."""
         if self.moves_cells:
-            labels.filter = self.filter
+            self._labels.filter = self.filter
 
 
 class MapFrame:
@@ -119,6 +119,8 @@ class MapFrame:
 
     Args:
         dimension: 2 or 3.
+        labels: of the map, which corrections move.
+        odometry: by scans, whose local map they make anew.
         closer: what closes loops between them; None: nothing does.
         in_background: apply corrections in parts, one with each scan; else at once.
 
@@ -126,8 +128,15 @@ class MapFrame:
         T_map_local: (D+1, D+1) of the frame of the odometry by scans.
     """
 
-    def __init__(self, dimension: int, closer: LoopClosing | None, in_background: bool) -> None:
-        D = dimension
+    def __init__(
+        self,
+        dimension: int,
+        labels: CausalLabels,
+        odometry: LiveOdometry,
+        closer: LoopClosing | None,
+        in_background: bool,
+    ) -> None:
+        D, self._labels, self._odometry = dimension, labels, odometry
         self.T_map_local = np.eye(D + 1)
         self._dimension, self._closer, self._in_background = D, closer, in_background
         # poses of the spaced scans: the first `_count` in the frame of the odometry by scans, and
@@ -186,20 +195,12 @@ class MapFrame:
                 closer.add(kept, registered.explained, self._drift)
         self._drift = np.zeros((3, 3))
 
-    def correct(
-        self,
-        labelled: Observation | None,
-        added: MappedScan | None,
-        labels: CausalLabels,
-        odometry: LiveOdometry,
-    ) -> None:
+    def correct(self, labelled: Observation | None, added: MappedScan | None) -> None:
         """Go on correcting the map after a scan, if loops were closed.
 
         Args:
             labelled: the scan if it was added to the labels.
             added: the same if it was added to the local map.
-            labels: of the map.
-            odometry: whose local map is made anew.
         """
         if self._correction is not None:
             if labelled is not None:
@@ -209,11 +210,11 @@ class MapFrame:
         elif (correction := self._poll()) is not None and len(correction.poses) > self._outdated:
             spaced = self._spaced[: self._count].copy()
             tagged = np.array(self._tagged)
-            new = MapCorrection(correction, labels, spaced, self.spaced_poses(), tagged)
+            new = MapCorrection(correction, self._labels, spaced, self.spaced_poses(), tagged)
             self._correction = None if new.is_small else new
             if new.is_small:
                 self._keep_untied(new)
-        self._go_on(labels, odometry, to_the_end=not self._in_background)
+        self.go_on(to_the_end=not self._in_background)
 
     def _poll(self) -> Correction | None:
         with self._while_disk_lasts() as closer:
@@ -240,20 +241,17 @@ class MapFrame:
         self.add_drift(covariance)
         self._outdated = self._count
 
-    def finish_correction(self, labels: CausalLabels, odometry: LiveOdometry) -> None:
-        """Finish the correction that was begun, if there is one."""
-        self._go_on(labels, odometry, to_the_end=True)
-
-    def _go_on(self, labels: CausalLabels, odometry: LiveOdometry, *, to_the_end: bool) -> None:
+    def go_on(self, *, to_the_end: bool) -> None:
+        """Apply a part, or all, of the correction that was begun, if there is one."""
         if self._correction is None:
             return
-        is_done = self._correction.step(labels)
+        is_done = self._correction.step()
         while to_the_end and not is_done:
-            is_done = self._correction.step(labels)
+            is_done = self._correction.step()
         if is_done:
-            self._correction.finish(labels)
+            self._correction.finish()
             motion = self._correction.T_map_local @ se2.inverse(self.T_map_local)
-            odometry.correct(self._correction.local_map, motion)
+            self._odometry.correct(self._correction.local_map, motion)
             self.T_map_local = self._correction.T_map_local
             self._corrected = self._correction.poses
             self._keep_untied(self._correction)

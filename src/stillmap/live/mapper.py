@@ -21,6 +21,7 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.from_arrays import poses_to_matrices
 from stillmap.live.global_localization import PlanarLocalizer
+from stillmap.live.history import History
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.live.online_slam import OnlineSlam
@@ -90,13 +91,10 @@ class LiveMapper:
         self._known = None if place is None else KnownMap(place)
         if self._known is not None and mode == "extend":
             self.options = adopt_cells(self.options, "map", {"resolution": self._known.resolution})
-        self._begin = partial(
-            OnlineSlam,
-            in_background=background,
-            folder=None if folder is None else Path(folder),
-            scratch=None if scratch is None else Path(scratch),
-            max_scratch=max_scratch,
-            lag=lag,
+        self._begin = partial(OnlineSlam, in_background=background, lag=lag)
+        drive, temporary = (None if path is None else Path(path) for path in (folder, scratch))
+        self._make_history = partial(
+            History, folder=drive, scratch=temporary, max_bytes=max_scratch
         )
         self._mapping: OnlineSlam | None = None  # since the first scan
         self._last_ns = 0
@@ -119,7 +117,8 @@ class LiveMapper:
         T_odom_base = _to_matrix(odometry, beams.dimension)
         if self._mapping is None:
             localizer = self._make_localizer(beams.dimension)  # which may change the options
-            self._mapping = self._begin(beams.dimension, self.options, localizer)
+            history = self._make_history(beams.dimension)
+            self._mapping = self._begin(self.options, history, localizer)
         self._last_ns = beams.stamp_ns
         return self._mapping.push(beams, T_odom_base)
 

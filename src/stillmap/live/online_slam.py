@@ -3,7 +3,6 @@
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -48,13 +47,10 @@ class OnlineSlam:
     """Poses, labels and map from the scans so far: EM with one M-step and two E-steps a scan.
 
     Args:
-        dimension: 2 or 3.
         options: see Options.
+        history: in which scans and answers are kept.
         place: localization in a known map; None: the map begins empty.
         in_background: close loops in a process of their own; else between two scans.
-        folder: a new one, for the recording of the drive; None: it has no name.
-        scratch: folder of temporary files; None: the system's.
-        max_scratch: bytes of beams that are kept, about; None: any number.
         lag: s after which each scan is labelled once more; None: it is not.
 
     Attributes:
@@ -68,17 +64,15 @@ class OnlineSlam:
 
     def __init__(
         self,
-        dimension: int,
         options: Options,
+        history: History,
         place: Localizer | None = None,
         *,
         in_background: bool = False,
-        folder: Path | None = None,
-        scratch: Path | None = None,
-        max_scratch: int | None = None,
         lag: float | None = None,
     ) -> None:
-        D, slam = dimension, resolve_resolution(options, dimension).slam
+        D = history.dimension
+        slam = resolve_resolution(options, D).slam
         threads = resolve_threads(options.threads)
         self.dimension, self.resolution = D, slam.resolution
         spacing = None if place is None else _SEARCH_DISTANCE
@@ -86,18 +80,19 @@ class OnlineSlam:
             ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads, spacing)
         )
         self.labels = CausalLabels(D, slam.resolution, options.em, threads)
-        self.history = History(D, folder, scratch, max_scratch)
+        self.history = history
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
-        self._place, self._finder = place, RobotFinder(place, D)
+        self._place = place
         self._lag_ns = None if lag is None else round(1e9 * lag)
         self._recent = deque[tuple[int, ScanBeams]]()  # scans to be labelled once more
         closer: LoopClosing | None = None
         if place is None and slam.loop_closure and in_background:
-            closer = LoopProcess(slam, D, scratch)
+            closer = LoopProcess(slam, D, history.scratch)
         elif place is None and slam.loop_closure:
-            closer = make_closer(slam, D, scratch, threads)
-        self.frame = MapFrame(D, closer, in_background)
+            closer = make_closer(slam, D, history.scratch, threads)
+        self.frame = MapFrame(D, self.labels, self.odometry, closer, in_background)
+        self._finder = RobotFinder(place, self.labels, self.odometry, self.frame)
         self._work_left: Callable[[], object] | None = None  # by the last scan
         self._T_odom_base: Float | None = None  # of the last scan
         self._path_begin = 0  # the first spaced scan in the frame of the map
@@ -129,15 +124,8 @@ class OnlineSlam:
         p_static = p_static.copy()  # the user has the other
 
         def keep() -> MappedScan | None:
-            self.history.append(
-                beams,
-                p_static,
-                T_odom_base,
-                pose=answer,
-                local=registered.T,
-                anchor=anchor,
-                twist=registered.twist,
-            )
+            poses = {"pose": answer, "local": registered.T, "anchor": anchor}
+            self.history.append(beams, p_static, T_odom_base, **poses, twist=registered.twist)
             if self._lag_ns is not None:
                 self._recent.append((len(self.history) - 1, beams))
             return self._add_to_maps(observation, np.nan_to_num(p_static), registered)
@@ -164,14 +152,14 @@ class OnlineSlam:
             number: how many scans were pushed before it.
         """
         answer = self.history.answer(number)
-        local = self._finder.move(answer["local"], number)
+        local = self._finder.move(answer["local"][None], number)[0]
         pose = self.frame.to_map(local, int(answer["anchor"]), number)
         return self.labels.label(deskew(beams, answer["twist"]), pose)
 
     def placement(self) -> tuple[Float, Int64]:
         """Poses and submaps of the scans that are kept, as they are known now: see `Snapshot`."""
         notes, is_whole = self.history.notes(), self.history.kept == len(self.history)
-        poses = self._finder.move_all(notes["local"])
+        poses = self._finder.move(notes["local"])
         if self._place is None:  # in a known map that frame is the map's
             poses = self.frame.to_map_all(poses, notes["anchor"], is_whole)
         submaps = self._finder.submaps(len(poses))
@@ -229,7 +217,7 @@ class OnlineSlam:
         if registered.is_carried:
             self._movers.clear()
             self._path_begin = self.frame.last + 1
-            self._finder.lose(len(self.history), self.labels, self.frame, self.odometry)
+            self._finder.lose(len(self.history))
             self.frame.begin_anew(len(self.history))
         elif not registered.is_contradicted:
             self._finder.agree(len(self.history))
@@ -255,8 +243,8 @@ class OnlineSlam:
             if added is not None:
                 self.frame.add(added, registered)
             agrees = None if registered.is_contradicted else observation
-            self.frame.correct(agrees, added, self.labels, self.odometry)
-        if self.dimension == 3 and self._finder.tie(self.frame, self.labels):
+            self.frame.correct(agrees, added)
+        if self.dimension == 3 and self._finder.tie():
             self._path_begin = 0
         return added
 
@@ -269,8 +257,8 @@ class OnlineSlam:
 
     def _find_robot(self, scan: PlanarHits | MappedScan, update: Update) -> Update:
         """Search the robot, which is lost; the update with its pose in the map, if it is found."""
-        frame, scans = self.frame, len(self.history)
-        place = self._finder.find(self.labels, scan, update.pose, scans, frame, self.odometry)
+        frame = self.frame
+        place = self._finder.find(scan, update.pose, len(self.history))
         if place is None:
             return update
         T, motion = place

@@ -9,6 +9,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import OwnMap, PlanarLocalizer
+from stillmap.live.local_map import LocalMap
 from stillmap.live.map_frame import LiveOdometry, MapFrame
 from stillmap.live.sweep_localization import SweepLocalizer
 
@@ -36,21 +37,31 @@ class _Stretch:
     T: Float | None = None
     is_tied: bool = False
 
-    def slice(self) -> slice:
-        return slice(self.first, self.last)
+    def slice(self, begin: int = 0) -> slice:
+        """Its scans, counted from scan `begin` on."""
+        last = None if self.last is None else max(self.last - begin, 0)
+        return slice(max(self.first - begin, 0), last)
 
 
 class RobotFinder:
     """Searches the robot while it is lost.
 
     Args:
-        place: localization in a known map; None: the robot maps.
-        dimension: 2 or 3; in 3D a robot that was carried while it maps is not searched, but lost
-            until loops are closed with the map.
+        place: localization in a known map; None: the robot maps. In 3D it is then not searched if
+            it was carried, but lost until loops are closed with the map.
+        labels: of the map, or of what was seen since the robot was lost.
+        odometry: by scans.
+        frame: of it in the map.
     """
 
-    def __init__(self, place: Localizer | None, dimension: int) -> None:
-        self._place, self._dimension = place, dimension
+    def __init__(
+        self,
+        place: Localizer | None,
+        labels: CausalLabels,
+        odometry: LiveOdometry,
+        frame: MapFrame,
+    ) -> None:
+        self._place, self._labels, self._odometry, self._frame = place, labels, odometry, frame
         self._carried: OwnMap | None = None
         # in 3D before it was carried: cells of the labels, and poses of the spaced scans
         self._left: tuple[OccupancyFilter, Float] | None = None
@@ -67,35 +78,35 @@ class RobotFinder:
     @property
     def is_lost(self) -> bool:
         """True if the robot is not localized in the map."""
-        search = self._carried or self._place
-        return self._left is not None or (search is not None and search.is_lost)
+        return self._left is not None or (self._search is not None and self._search.is_lost)
 
     @property
     def is_ambiguous(self) -> bool:
         """True if several poses in the map fit about equally well."""
-        search = self._carried or self._place
-        return search is not None and search.is_ambiguous
+        return self._search is not None and self._search.is_ambiguous
+
+    @property
+    def _search(self) -> Localizer | None:
+        return self._carried or self._place
 
     def agree(self, scan: int) -> None:
         """A scan agrees with what is seen since the robot was lost, or with the map."""
         self._last_agreed = scan
 
-    def lose(
-        self, scan: int, labels: CausalLabels, frame: MapFrame, odometry: LiveOdometry
-    ) -> None:
+    def lose(self, scan: int) -> None:
         """The robot was carried before a scan: the labels begin anew, until it is found."""
         self._begin_stretch(scan)
+        labels, left_behind = self._labels, self._odometry.left_behind
         if self._carried is None:
-            frame.finish_correction(labels, odometry)
-        search = self._carried or self._place
-        if search is not None:
-            search.forget(labels)
-            search.is_lost = True
-        elif self._dimension == 2:
-            self._carried = OwnMap(labels, odometry.left_behind)
+            self._frame.go_on(to_the_end=True)
+        if self._search is not None:
+            self._search.forget(labels)
+            self._search.is_lost = True
+        elif isinstance(left_behind, LocalMap):
+            self._carried = OwnMap(labels, left_behind)
         else:
             if self._left is None:
-                self._left = labels.filter, frame.spaced_poses()
+                self._left = labels.filter, self._frame.spaced_poses()
             labels.filter = labels.filter.sibling()
 
     def _begin_stretch(self, scan: int) -> None:
@@ -105,34 +116,24 @@ class RobotFinder:
         self._stretches.append(_Stretch(scan))
         self._contradicted.append((agreed, scan))
 
-    def find(
-        self,
-        labels: CausalLabels,
-        scan: Any,
-        pose: Float,
-        scans: int,
-        frame: MapFrame,
-        odometry: LiveOdometry,
-    ) -> tuple[Float, Float] | None:
+    def find(self, scan: Any, pose: Float, scans: int) -> tuple[Float, Float] | None:
         """Search the robot in the map, in which labels and odometry then go on.
 
         Args:
-            labels: of what was seen since it was lost.
             scan: the last one, see `Localizer.localize`.
             pose: (D+1, D+1) of the robot in the frame of the labels.
             scans: number of scans so far.
-            frame: of the map.
-            odometry: by scans.
 
         Returns:
             (D+1, D+1) by which its frame moves, and by which poses in the map do; None: not found.
         """
-        search = self._carried or self._place
+        search, labels, frame = self._search, self._labels, self._frame
         T = None if search is None else search.localize(labels, scan, pose)
         if search is None or T is None:
             return None
         motion = np.asarray(se2.inverse(frame.T_map_local) @ T @ frame.T_map_local)
-        odometry.enter(search.make_local_map(odometry.local_map, motion), motion)
+        local_map = search.make_local_map(self._odometry.local_map, motion)
+        self._odometry.enter(local_map, motion)
         seen = labels.filter
         known = search.known_filter(seen.sibling())
         take_over(known, seen, np.tile(T, (labels.tags, 1, 1)), 0, seen.block_count)
@@ -142,15 +143,12 @@ class RobotFinder:
         self._stretches[-1].last, self._stretches[-1].T = scans, motion
         return motion, T
 
-    def tie(self, frame: MapFrame, labels: CausalLabels) -> bool:
-        """While it maps in 3D, the robot is found once loops show where it is; True if they do now.
-
-        Args:
-            frame: of the map.
-            labels: of what was seen since it was lost; they become those of the map with it.
-        """
+    def tie(self) -> bool:
+        """While it maps in 3D, the robot is found once loops show where it is; True if they do now:
+        the labels are those of the map then, with what was seen since it was lost."""
         if self._place is not None:
             return False
+        labels, frame = self._labels, self._frame
         untied = frame.untied
         for stretch in self._stretches:
             stretch.is_tied = stretch.first not in untied
@@ -163,19 +161,14 @@ class RobotFinder:
             take_over(labels.filter, source, motion, 0, source.block_count)
         return True
 
-    def move(self, local: Float, scan: int) -> Float:
-        """(D+1, D+1) a pose in the frame of the odometry by scans, as it is known now."""
-        for stretch in self._stretches:
-            if stretch.T is not None and stretch.first <= scan < (stretch.last or 0):
-                return np.asarray(stretch.T @ local)
-        return local
-
-    def move_all(self, local: Float) -> Float:
-        """(T, D+1, D+1) the same of all scans."""
+    def move(self, local: Float, first: int = 0) -> Float:
+        """(K, D+1, D+1) poses in the frame of the odometry by scans, as they are known now, of the
+        scans from the first one on."""
         out = local.copy()
         for stretch in self._stretches:
             if stretch.T is not None:
-                out[stretch.slice()] = stretch.T @ out[stretch.slice()]
+                moved = stretch.slice(first)
+                out[moved] = stretch.T @ out[moved]
         return out
 
     def submaps(self, scans: int) -> Int64:

@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan, PointCloud2
 from std_srvs.srv import Trigger
@@ -33,6 +34,7 @@ from stillmap.pipeline.options import Options
 
 _NAME = "stillmap"
 _ODOMETRY_DEPTH = 50
+_SPIN = 0.1  # s after which a signal is seen at the latest
 _POLL = 0.02  # s after which scans that wait are tried again
 _STATUS_PERIOD = 1.0  # s
 _LATENCIES = 1000  # scans over which latency is given
@@ -40,8 +42,6 @@ _LATENCIES = 1000  # scans over which latency is given
 
 class LiveNode:
     """Maps what arrives, and answers.
-
-    `node` and `save_node` are to be spun, each in a thread of its own.
 
     Args:
         options: see Options.
@@ -58,10 +58,9 @@ class LiveNode:
         self,
         options: Options,
         output: Path,
-        *,
         overwrite: bool,
         make_mapper: Callable[[Options], LiveMapper],
-        show: Show | None = None,
+        show: Show | None,
     ) -> None:
         self.node = rclpy.create_node(_NAME)
         self._output, self._overwrite, self._show = output, overwrite, show
@@ -82,15 +81,37 @@ class LiveNode:
         self._stamp_ns, self.scans, self._map_due, self._is_map_old = 0, 0, 0.0, False
         self._doubts, self._reported = Counter[str](), Counter[str]()
         self._subscribe()
-        self.save_node = self._make_save_node()
+        self._save_node = self._make_save_node()
         self._mapper = make_mapper(options)
+
+    def spin(self, stop: threading.Event) -> None:
+        """Answer until `stop`; requests to save in a thread of their own, so that mapping goes on.
+
+        Not by an executor of several threads: that of rclpy hands a callback that waits to its
+        threads over and over, and nothing else gets to run meanwhile.
+        """
+
+        def spin(node: Any) -> None:
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            while not stop.is_set():
+                executor.spin_once(timeout_sec=_SPIN)
+            executor.remove_node(node)
+
+        saves = threading.Thread(target=spin, args=(self._save_node,))
+        saves.start()
+        try:
+            spin(self.node)
+        finally:
+            stop.set()
+            saves.join()
 
     def close(self) -> None:
         """Forget all scans."""
         if self._former is not None:
             self._former.join()
         self._mapper.close()
-        self.save_node.destroy_node()
+        self._save_node.destroy_node()
         self.node.destroy_node()
 
     def save(self, progress: Progress = no_progress) -> None:
@@ -135,7 +156,7 @@ class LiveNode:
         node.create_timer(_STATUS_PERIOD, self._report, clock=steady)
 
     def _make_save_node(self) -> Any:
-        """A hidden node with the service ~/save_map, to be spun beside the other one."""
+        """A hidden node with the service ~/save_map."""
         # without arguments: a new name or namespace is meant for the other one
         node = rclpy.create_node(
             f"_{_NAME}_save",
