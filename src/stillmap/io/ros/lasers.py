@@ -44,6 +44,12 @@ class ScanShape(NamedTuple):
     range_max: float
     time_increment: float
 
+    @classmethod
+    def of(cls, message: Any, n: int) -> "ScanShape":
+        """That of a message with n readings."""
+        angles = message.angle_min, message.angle_increment
+        return cls(*angles, n, message.range_min, message.range_max, message.time_increment)
+
     def find_fault(self) -> str | None:
         """Why such a scan cannot be used."""
         if self.n == 0 or self.n > _MAX_READINGS:
@@ -83,9 +89,7 @@ class LaserScans:
 
     def add(self, message: Any, ranges: Float32, log_ns: int, number: int) -> str | None:
         """Add a scan; returns the reason if it cannot be used."""
-        names = ("range_min", "range_max", "time_increment")
-        more = (getattr(message, name) for name in names)
-        shape = ScanShape(message.angle_min, message.angle_increment, len(ranges), *more)
+        shape = ScanShape.of(message, len(ranges))
         if shape not in self._shapes and (fault := shape.find_fault()) is not None:
             return fault
         known = self._shapes.setdefault(shape, len(self._shapes))

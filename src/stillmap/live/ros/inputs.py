@@ -121,18 +121,6 @@ class Mount(NamedTuple):
     is_upside_down: bool = False
 
 
-def shape_of(message: Any) -> ScanShape:
-    """The beams of a LaserScan; `find_fault` says why they cannot be used."""
-    return ScanShape(
-        message.angle_min,
-        message.angle_increment,
-        len(message.ranges),
-        message.range_min,
-        message.range_max,
-        message.time_increment,
-    )
-
-
 def to_scan_beams(message: Any, topic: str, mount: Mount, parameters: Parameters) -> ScanBeams:
     """The beams of a LaserScan or PointCloud2 without fault, in its order.
 
@@ -152,7 +140,7 @@ def to_scan_beams(message: Any, topic: str, mount: Mount, parameters: Parameters
 
 def _laser_fields(message: Any, mount: Mount) -> dict[str, Any]:
     """Fields of a `Scan` from a LaserScan."""
-    shape = shape_of(message)
+    shape = ScanShape.of(message, len(message.ranges))
     angles, times = shape.angles(), shape.time_increment * np.arange(shape.n)
     has_times = 0.0 < shape.time_increment * shape.n <= _MAX_SCAN_TIME
     limits = {"min_range": shape.range_min, "max_range": shape.range_max}
@@ -212,6 +200,6 @@ def end_points(message: Any, beams: ScanBeams, chosen: Bool) -> Float32:
     if beams.dimension == 3:
         return beams.points[chosen]
     ranges = np.asarray(message.ranges, np.float64)[chosen]
-    angles = shape_of(message).angles()[chosen]
+    angles = ScanShape.of(message, len(message.ranges)).angles()[chosen]
     flat = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
     return np.asarray(ranges[:, None] * flat, np.float32)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from stillmap.core.array_types import Float
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.ros.clouds import find_layout
+from stillmap.io.ros.lasers import ScanShape
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.live.ros.inputs import Mount, Parameters, shape_of, to_scan_beams
+from stillmap.live.ros.inputs import Mount, Parameters, to_scan_beams
 from stillmap.live.scan import ScanBeams
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ class ScanIntake:
 
     def _find_damage(self, message: Any) -> str | None:
         if self._parameters.dimension == 2:
-            return shape_of(message).find_fault()
+            return ScanShape.of(message, len(message.ranges)).find_fault()
         layout = find_layout(message)
         return layout if isinstance(layout, str) else None
 

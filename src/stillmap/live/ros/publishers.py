@@ -25,13 +25,8 @@ from stillmap.io.ros.messages import stamp_ns
 from stillmap.io.trajectory import embed_in_3d, quaternion_from_pose
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
-from stillmap.live.ros.inputs import (
-    Parameters,
-    end_points,
-    split_ranges,
-    spread_covariance,
-    to_cells,
-)
+from stillmap.live.ros import inputs
+from stillmap.live.ros.inputs import Parameters
 from stillmap.live.ros.intake import Arrival
 from stillmap.live.update import Update
 from stillmap.pipeline.options import MapMode
@@ -81,7 +76,7 @@ class Publishers:
         names, stamp = self._parameters, stamp_ns(arrival.message.header)
         is_lost = "lost" in update.doubts
         if not is_lost:
-            covariance = spread_covariance(update.covariance)
+            covariance = inputs.spread_covariance(update.covariance)
             pose = geometry.PoseWithCovariance(pose=_to_pose(update.pose), covariance=covariance)
             header = _to_header(names.map_frame, stamp)
             self._pose.publish(geometry.PoseWithCovarianceStamped(header=header, pose=pose))
@@ -103,15 +98,13 @@ class Publishers:
             return
         self._tf_ns = stamp
         until = stamp + round(1e9 * names.transform_timeout)
-        self._tf.sendTransform(
-            geometry.TransformStamped(
-                header=_to_header(names.map_frame, until),
-                child_frame_id=names.odom_frame or names.base_frame,
-                transform=geometry.Transform(
-                    translation=_to_vector(T[:-1, -1], geometry.Vector3), rotation=_to_rotation(T)
-                ),
-            )
+        translation, rotation = _to_vector(T[:-1, -1], geometry.Vector3), _to_rotation(T)
+        message = geometry.TransformStamped(
+            header=_to_header(names.map_frame, until),
+            child_frame_id=names.odom_frame or names.base_frame,
+            transform=geometry.Transform(translation=translation, rotation=rotation),
         )
+        self._tf.sendTransform(message)
 
     def _publish_movers(self, movers: Sequence[Mover], stamp: int) -> None:
         """The movers of a scan; markers of earlier ones are removed."""
@@ -145,7 +138,7 @@ class Publishers:
                 publisher.publish(_to_cloud(arrival, p_static, is_end & chosen))
             return
         ranges = np.asarray(arrival.message.ranges, np.float32)
-        split = split_ranges(ranges, arrival.beams.hit, p_static)
+        split = inputs.split_ranges(ranges, arrival.beams.hit, p_static)
         for publisher, of_label in zip(parts, split, strict=True):
             message = copy.copy(arrival.message)
             message.ranges = _to_data(of_label.astype(np.float32), "f")
@@ -190,7 +183,7 @@ class MapPublisher:
 
     def publish(self, grid: GridMap, stamp: int) -> None:
         """The whole map; who comes later gets the last one."""
-        self._cells = to_cells(grid.p_occupied, self._mode)
+        self._cells = inputs.to_cells(grid.p_occupied, self._mode)
         self._first = np.rint(np.array(grid.origin[:2]) / grid.resolution).astype(np.int64)
         self._low, self._high = np.array(self._cells.shape), np.zeros(2, np.int64)
         header, (height, width) = _to_header(self._frame, stamp), self._cells.shape
@@ -236,7 +229,7 @@ class MapPublisher:
         self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
         if self._holds(low, high):
             (row, column), (end, right) = low.tolist(), high.tolist()
-            self._cells[row:end, column:right] = to_cells(change.p_occupied, self._mode)
+            self._cells[row:end, column:right] = inputs.to_cells(change.p_occupied, self._mode)
 
     def _holds(self, low: Int64, high: Int64) -> bool:
         return bool((low >= 0).all() and (high <= self._cells.shape).all())
@@ -269,7 +262,7 @@ def _to_markers(mover: Mover, header: Any) -> list[Any]:
 
 def _to_cloud(arrival: Arrival, p_static: Float32, chosen: Bool) -> Any:
     """A PointCloud2 of the chosen (N,) end points of a scan with their P(static)."""
-    points = end_points(arrival.message, arrival.beams, chosen)
+    points = inputs.end_points(arrival.message, arrival.beams, chosen)
     rows, header = np.column_stack([points, p_static[chosen]]), arrival.message.header
     return PointCloud2(
         header=_to_header(header.frame_id, stamp_ns(header)),

@@ -15,7 +15,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.io.ros.messages import frame_name
 from stillmap.io.ros.tf import project_to_plane
-from stillmap.io.trajectory import MAX_TRANSLATION
+from stillmap.io.trajectory import MAX_TRANSLATION, poses_from_rows
 from stillmap.live.ros.inputs import Mount, Parameters
 
 _MESSAGES, _ROBOT = "stillmap_odometry", "stillmap_robot"  # frames of Odometry messages
@@ -123,7 +123,6 @@ class Transforms:
             message = self.buffer.lookup_transform_core(target, source, Time(nanoseconds=stamp))
         except TransformException:
             return None
-        T, t, q = np.eye(4), message.transform.translation, message.transform.rotation
-        T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-        T[:3, 3] = t.x, t.y, t.z
+        t, q = message.transform.translation, message.transform.rotation
+        T = poses_from_rows(np.array([[t.x, t.y, t.z, q.x, q.y, q.z, q.w]]))[0]
         return T if (np.abs(T) < MAX_TRANSLATION).all() else None
