@@ -11,7 +11,6 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
 from stillmap.live.causal_labels import CausalLabels, take_over
-from stillmap.live.map_frame import rotate_covariance
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.scan import Observation, to_beams
 from stillmap.results.eval.trajectory import compute_absolute_errors
@@ -166,11 +165,11 @@ def test_loops_are_closed_in_the_background(corridor, fresh):
 
 def test_a_covariance_follows_the_axes_of_its_frame():
     turn = se2.matrix(1.0, 2.0, np.pi / 2)
-    found = rotate_covariance(np.diag([4.0, 1.0, 0.1]), turn)
+    found = se2.rotate_covariance(np.diag([4.0, 1.0, 0.1]), turn)
     np.testing.assert_allclose(found, np.diag([1.0, 4.0, 0.1]), atol=1e-12)
     T = np.eye(4)
     T[:2, :2] = turn[:2, :2]
-    found = rotate_covariance(np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2]), T)
+    found = se2.rotate_covariance(np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2]), T)
     np.testing.assert_allclose(found, np.diag([1.0, 4.0, 2.0, 0.1, 0.4, 0.2]), atol=1e-12)
 
 

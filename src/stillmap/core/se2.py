@@ -91,10 +91,14 @@ def align_points(source: Float, target: Float) -> Float:
 
 
 def rotate_covariance(covariance: Float, T: Float) -> Float:
-    """Rotate covariances (..., 3, 3) of x, y, theta by the rotations of poses (..., 3, 3)."""
-    R = np.zeros(T.shape)
-    R[..., :2, :2] = T[..., :2, :2]
-    R[..., 2, 2] = 1.0
+    """Rotate covariances of poses by the rotations of poses (..., D+1, D+1).
+
+    They are (..., 3, 3) of x, y and heading, in 3D (..., 6, 6) of translation and rotation.
+    """
+    D = T.shape[-1] - 1
+    R = np.zeros((*T.shape[:-2], 3 * (D - 1), 3 * (D - 1)))
+    R[..., :D, :D] = T[..., :D, :D]
+    R[..., D:, D:] = T[..., :D, :D] if D == 3 else 1.0
     return R @ covariance @ np.swapaxes(R, -1, -2)
 
 

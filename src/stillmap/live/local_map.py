@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 import stillmap._core as _core
-from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.history import GrowingRecording
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import loop_closure, loop_closure_3d, scan_hits
-from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
+from stillmap.slam.local_map import is_spaced
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopContext
 
@@ -75,8 +74,10 @@ class LocalMap:
     def add(self, scan: MappedScan) -> bool:
         """Add a scan unless it is too close to the last one of its sensor; True if it was added."""
         last = self._last.get(scan.beams.sensor)
-        if last is not None and not is_spaced(last, scan):
-            return False
+        if last is not None:
+            step_ns = scan.beams.stamp_ns - last.beams.stamp_ns
+            if not is_spaced(last.T_map_base, scan.T_map_base, step_ns):
+                return False
         self._insert(scan)
         self._recent.append(scan)
         return True
@@ -134,13 +135,6 @@ def relabel_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, label: Labeller)
     T = scan.T_map_base @ beams.T_base_sensor
     scan_hits.replace_weights(grid, beams.points, beams.hit, scan.e, relabelled.e, T)
     return relabelled
-
-
-def is_spaced(last: MappedScan, scan: MappedScan) -> bool:
-    """True if a scan shows enough that is new after the last one."""
-    x, y, theta = se2.parameters(se2.inverse(last.T_map_base) @ scan.T_map_base)
-    seconds = 1e-9 * (scan.beams.stamp_ns - last.beams.stamp_ns)
-    return bool(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds >= SCAN_SPACING)
 
 
 def add_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, *, remove: bool = False) -> None:
@@ -206,9 +200,6 @@ class SpacedScans(GrowingRecording):
         """One of the scans of a context."""
         recording = context.recording
         sensor = list(self._mounts)[recording.sensor[number]]
-        return MappedScan(
-            ScanBeams.of(recording, number, sensor),
-            np.array(context.e[recording.beams_of(number)]),
-            context.poses[number],
-            float(context.travelled[number]),
-        )
+        beams = ScanBeams.of(recording, number, sensor)
+        e = np.array(context.e[recording.beams_of(number)])
+        return MappedScan(beams, e, context.poses[number], float(context.travelled[number]))

@@ -312,13 +312,3 @@ class MapFrame:
         """End the process that closes loops, if there is one."""
         if self._closer is not None:
             self._closer.stop()
-
-
-def rotate_covariance(covariance: Float, T: Float) -> Float:
-    """Covariance of a pose along the axes of another frame, in which its own frame has the pose
-    T (D+1, D+1): (3, 3) of x, y and heading, in 3D (6, 6) of translation and rotation."""
-    D, turn = len(T) - 1, np.eye(len(covariance))
-    turn[:D, :D] = T[:D, :D]
-    if D == 3:
-        turn[D:, D:] = T[:D, :D]
-    return np.asarray(turn @ covariance @ turn.T)

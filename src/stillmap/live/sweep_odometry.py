@@ -12,10 +12,11 @@ from stillmap.live.registration import Crowd, Registration
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import constant_velocity, lidar_odometry
 from stillmap.slam.constant_velocity import State
-from stillmap.slam.lidar_odometry import Sweep
+from stillmap.slam.lidar_odometry import Sweep, follow_sweep
 from stillmap.slam.local_map import KEYFRAME_ANGLE
 from stillmap.slam.loop_closure_3d import KEYFRAME_DISTANCE
 from stillmap.slam.options import SlamOptions
+from stillmap.slam.scan_hits import transform_points
 
 # sweeps from which the motion during the first one is found; m/s and rad/s of it that matter
 _FIRST_SWEEPS, _MIN_MOTION = 5, 0.05
@@ -88,10 +89,7 @@ class SweepOdometry:
         """Register a sweep by its hits with weights P(static)."""
         state, explained, is_blind = prior, 1.0, not float(hits.weights.sum()) > 0.0
         if self._stamp_ns is not None and not is_blind:
-            registered = lidar_odometry.downsample_sweep(hits)
-            state, explained = lidar_odometry.register_sweep(
-                self.local_map, registered, prior, self._threads
-            )
+            state, explained = follow_sweep(self.local_map, hits, prior, self._threads)
         is_carried = not is_blind and self._is_carried(explained)
         if is_carried:
             self._start_anew()
@@ -99,18 +97,11 @@ class SweepOdometry:
         self._advance(state, beams.stamp_ns)
         if not is_blind:
             self._note_first(beams.stamp_ns, hits)
-        state = self._state
-        return Registration(
-            state.T_map_base,
-            lidar_odometry.rotate_to_map(state),
-            explained,
-            np.zeros((3, 3)),
-            state.twist,
-            self._is_slipping,
-            is_blind,
-            is_carried,
-            self._contradictions > 0,
-        )
+        T = self._state.T_map_base
+        covariance = se2.rotate_covariance(self._state.covariance[:6, :6], T)
+        doubts = self._is_slipping, is_blind, is_carried, self._contradictions > 0
+        drift, twist = np.zeros((3, 3)), self._state.twist
+        return Registration(T, covariance, explained, drift, twist, *doubts)
 
     def add(
         self, beams: ScanBeams, e: Float32, _recent: Float32, _label: Labeller
@@ -125,23 +116,19 @@ class SweepOdometry:
         if self._contradictions:
             return None
         kept, state = take_beams(beams, self._kept), self._state
-        T, weights = kept.T_base_sensor, e[self._kept]
-        in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        in_base, weights = transform_points(kept.points, kept.T_base_sensor), e[self._kept]
         if self._known is not None:
             self._known.add(in_base, weights, state.T_map_base)
         else:
             self.local_map.add(in_base, weights, state.T_map_base)
-            self._forget_what_is_far()
+            here = state.T_map_base[:3, 3]
+            if np.linalg.norm(here - self._cropped_at) > lidar_odometry.CROP_STEP:
+                self._cropped_at = here.copy()
+                self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
         if self._since < 1.0 or not weights.any():
             return None
         self._since = 0.0
         return MappedScan(kept, weights, state.T_map_base, self.travelled)
-
-    def _forget_what_is_far(self) -> None:
-        T = self._state.T_map_base
-        if np.linalg.norm(T[:3, 3] - self._cropped_at) > lidar_odometry.CROP_STEP:
-            self._cropped_at = T[:3, 3].copy()
-            self.local_map.crop(T, lidar_odometry.MAX_RANGE)
 
     def enter(self, known: Any, T: Float) -> None:
         """Go on in a known map, in whose frame the frame so far has the pose T (4, 4)."""
@@ -195,10 +182,7 @@ class SweepOdometry:
         for stamp, sweep in first:
             if stamp != before:
                 prior = constant_velocity.predict(start, 1e-9 * (stamp - before))
-                registered = lidar_odometry.downsample_sweep(sweep)
-                start, _ = lidar_odometry.register_sweep(
-                    self.local_map, registered, prior, self._threads
-                )
+                start, _ = follow_sweep(self.local_map, sweep, prior, self._threads)
             if sweep is not hits:  # `add` adds the last one
                 self.local_map.add(sweep.deskew(start.twist), sweep.weights, start.T_map_base)
             before = stamp

@@ -8,7 +8,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
 
-# for people
+# in the order of `Update.doubts`, for people
 DOUBTS = MappingProxyType(
     {
         "slip": "odometry disagrees with the scans",

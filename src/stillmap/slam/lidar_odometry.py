@@ -207,11 +207,10 @@ class _SweepOdometry:
         for t in self.recording.iter_scans(range(n), self.e):
             sweep = select_sweep(self.recording, self.e, t)
             if t:
-                prior = self._predict(state, t)
-                points = downsample_sweep(sweep, self.max_points)
-                state, explained[t] = register_sweep(local, points, prior, self.threads)
+                prior, limits = self._predict(state, t), (self.threads, self.max_points)
+                state, explained[t] = follow_sweep(local, sweep, prior, *limits)
             poses[t], twists[t] = state.T_map_base, state.twist
-            covariance[t] = rotate_to_map(state)
+            covariance[t] = se2.rotate_covariance(state.covariance[:6, :6], state.T_map_base)
             local.add(sweep.deskew(state.twist), sweep.weights, state.T_map_base)
             if np.linalg.norm(poses[t, :3, 3] - cropped_at) > CROP_STEP:
                 cropped_at = poses[t, :3, 3].copy()
@@ -261,6 +260,13 @@ def register_sweep(
     return State(T, twist, covariance), met / max(total, 1e-9)
 
 
+def follow_sweep(
+    local: _core.NdtMap3D, sweep: Sweep, prior: State, threads: int, max_points: int = _MAX_POINTS
+) -> tuple[State, float]:
+    """As `register_sweep`, by at most so many points of the sweep."""
+    return register_sweep(local, downsample_sweep(sweep, max_points), prior, threads)
+
+
 def match_planes(local: _core.NdtMap3D, points: Float, T_map_base: Float) -> tuple[Float, Bool]:
     """Normals (N, 3) in the base frame at points (N, 3), and which points lie on planes (N,).
 
@@ -278,10 +284,3 @@ def _prior_distance(covariance: Float) -> float:
     """m that a sweep may be off planes, by the covariance (12, 12) of its prior."""
     place, turn = (np.linalg.eigvalsh(covariance[i : i + 3, i : i + 3])[-1] for i in (0, 3))
     return float(np.sqrt(max(place, 1e-12)) + _LEVER_ARM * np.sqrt(max(turn, 0.0)))
-
-
-def rotate_to_map(state: State) -> Float:
-    """(6, 6) covariance of the pose along the axes of the map."""
-    turn = np.kron(np.eye(2), state.T_map_base[:3, :3])
-    out: Float = turn @ state.covariance[:6, :6] @ turn.T
-    return out

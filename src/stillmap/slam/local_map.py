@@ -17,6 +17,13 @@ SPACING_PER_SECOND = 0.2
 KEYFRAME_ANGLE = 0.5  # rad between keyframes
 
 
+def is_spaced(T_last: Float, T_map_base: Float, step_ns: int) -> bool:
+    """True if a scan at a pose (3, 3) shows enough that is new after the last one."""
+    x, y, theta = se2.parameters(se2.inverse(T_last) @ T_map_base)
+    seconds = 1e-9 * float(step_ns)
+    return bool(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds >= SCAN_SPACING)
+
+
 class LocalMap:
     """A map of spaced scans along the last stretch of travel.
 
@@ -59,10 +66,8 @@ class LocalMap:
         if kept is None:
             return True
         last, T_last, _ = kept
-        x, y, theta = se2.parameters(se2.inverse(T_last) @ T_map_base)
-        seconds = 1e-9 * float(self._recording.stamp_ns[t] - self._recording.stamp_ns[last])
-        spacing = float(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds)
-        return spacing >= SCAN_SPACING
+        stamps = self._recording.stamp_ns
+        return is_spaced(T_last, T_map_base, stamps[t] - stamps[last])
 
     def _last_of(self, sensor: int) -> tuple[int, Float, float] | None:
         of_sensor = (
