@@ -77,8 +77,10 @@ def select_scans(context: LoopContext, state: LoopState) -> Bool:
         alike[np.abs(travelled[alike] - travelled[k]) > MIN_LOOP_TRAVEL]
         for k, alike in enumerate(_iter_near(state.poses))
     ]
-    stay = _find_first(of, near) | _find_indispensable(travelled, of, keyframes, state.fitting)
-    stay |= _find_latest(of, near, stay)
+    passes = np.unique(of)
+    stay = _find_indispensable(travelled, of, keyframes, state.fitting)
+    stay |= _select_passes(passes, of, near, 1, np.zeros(len(of), np.bool_))
+    stay |= _select_passes(passes[::-1], of, near, _LATEST, stay)
     is_recent = context.travelled > context.travelled[-1] - _RECENT
     out: Bool = is_recent | np.isin(stretch, of[stay])
     return out & ~_find_standing(context.poses, keyframes)
@@ -100,25 +102,23 @@ def _iter_distances(poses: Float, among: Float) -> Iterator[tuple[Float, Float]]
         yield away, np.abs(se2.wrap(rows[..., 2] - known[:, 2]))
 
 
-def _find_first(of: Index, near: Sequence[Index]) -> Bool:
-    """(K,) keyframes of stretches in which a place was seen for the first time."""
-    stay = np.zeros(len(of), np.bool_)
-    for stretch in np.unique(of):
-        members = np.flatnonzero(of == stretch).tolist()
-        if any(not stay[near[k]].any() for k in members):
-            stay[members] = True
-    return stay
+def _select_passes(passes: Index, of: Index, near: Sequence[Index], most: int, stay: Bool) -> Bool:
+    """(K,) keyframes of the first passes through each place.
 
-
-def _find_latest(of: Index, near: Sequence[Index], stay: Bool) -> Bool:
-    """(K,) keyframes of the latest stretches at each place; `stay`: those that stay anyhow."""
-    latest = np.zeros(len(of), np.bool_)
-    for stretch in np.unique(of)[::-1]:
+    Args:
+        passes: all stretches, in the order in which they are taken.
+        of: (K,) stretch of each keyframe.
+        near: keyframes that show the same place as each.
+        most: passes of a place, about.
+        stay: (K,) keyframes that stay anyhow.
+    """
+    chosen = np.zeros(len(of), np.bool_)
+    for stretch in passes:
         members = np.flatnonzero(of == stretch).tolist()
-        is_needed = (len(np.unique(of[near[k][latest[near[k]]]])) < _LATEST for k in members)
+        is_needed = (len(np.unique(of[near[k][chosen[near[k]]]])) < most for k in members)
         if stay[members].any() or any(is_needed):
-            latest[members] = True
-    return latest
+            chosen[members] = True
+    return chosen
 
 
 def _find_indispensable(
@@ -190,9 +190,5 @@ def _move_closure(
         return None
     # both are tied to what is around them by loops
     floor = np.square([CLOSURE_TRANSLATION] * 2 + [CLOSURE_ROTATION])
-    return dataclasses.replace(
-        closure,
-        earlier=int(keyframes[k]),
-        T=between @ closure.T,
-        covariance=closure.covariance + np.diag(floor),
-    )
+    T, covariance = between @ closure.T, closure.covariance + np.diag(floor)
+    return dataclasses.replace(closure, earlier=int(keyframes[k]), T=T, covariance=covariance)

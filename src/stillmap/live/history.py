@@ -105,9 +105,8 @@ class GrowingRecording:
         if known != self._noted:
             self._write_header(is_open=True)
             self._noted = known
-        row = np.zeros(1, self._arrays["notes"].dtype)
-        for name, value in notes.items():
-            row[name] = value
+        note = self._arrays["notes"].dtype
+        row = np.array(tuple(notes[name] for name in note.names or ()), note)
         unknown = np.full(beams.T_base_sensor.shape, np.nan)
         rows: dict[str, Any] = {
             "label": label,

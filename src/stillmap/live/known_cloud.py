@@ -130,16 +130,11 @@ class KnownCloud:
             self._columns(self.points[is_obstacle & which]) for which in (stands, ~stands)
         )
         gone &= ~there & grid.occupied
-        p_occupied = np.where(gone, np.float32(0.0), grid.p_occupied)
+        there &= grid.occupied
+        left = replace(grid, p_occupied=np.where(gone, np.float32(0.0), grid.p_occupied))
         hits[gone] = 0.0
-        return KeptMap(
-            replace(grid, p_occupied=p_occupied),
-            hits,
-            there & grid.occupied,
-            self.points[stands].astype(np.float64),
-            self.p_static[stands],
-            thin_route(self.poses),
-        )
+        points, p_static = self.points[stands].astype(np.float64), self.p_static[stands]
+        return KeptMap(left, hits, there, points, p_static, thin_route(self.poses))
 
     def _columns(self, points: Float32) -> Bool:
         """(H, W) cells of the planar map in which points (N, 3) lie."""

@@ -25,7 +25,7 @@ from stillmap.results import reader
 from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.near_result import ROUTE, NearResult
 from stillmap.results.point_cloud import Block, append_vertices, cloud_from_folder
-from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, Grid
+from stillmap.results.reader import Grid
 from stillmap.slam import scan_hits
 
 Layer = NDArray[np.floating]
@@ -85,19 +85,16 @@ def _make_room(
     """The corner of the box around two maps with the same axes and cells, one of which lies on the
     other, and what spreads layers of each over the box, with a value elsewhere."""
     edge = above.resolution
-    shapes = np.array([grid.p_occupied.shape for grid in (below, above)])
     corners = np.array([grid.origin[1::-1] for grid in (below, above)])
     corners = np.round(corners / edge).astype(int)
-    low = corners.min(axis=0)
-    shape = ((corners + shapes).max(axis=0) - low).tolist()
+    ends = corners + [grid.p_occupied.shape for grid in (below, above)]
+    low, high = corners.min(axis=0), ends.max(axis=0)
 
-    def spread(corner: tuple[int, int], layer: Layer, fill: float) -> Layer:
-        out, (row, column) = np.full(shape, fill, np.float32), corner
-        out[row : row + layer.shape[0], column : column + layer.shape[1]] = layer
-        return out
+    def spread(margins: Int64, layer: Layer, fill: float) -> Layer:
+        return np.pad(np.asarray(layer, np.float32), margins, constant_values=fill)
 
     y, x = (low * edge).tolist()
-    lower, upper = (partial(spread, tuple(corner)) for corner in (corners - low).tolist())
+    lower, upper = (partial(spread, m) for m in np.stack([corners - low, high - ends], axis=2))
     return (x, y, 0.0), lower, upper
 
 
@@ -190,7 +187,7 @@ class KnownMap:
 
     def prime(self, labels: OccupancyFilter) -> None:
         """Tell the filters of cells what the map knows."""
-        free = self.grid.centres(np.argwhere(self.grid.p_occupied < FREE_THRESH))
+        free = self.grid.centres(np.argwhere(self.grid.free))
         centres = np.concatenate([self._centres, free])
         cells = np.floor(centres / labels.resolution).astype(np.int64)
         occupied = np.arange(len(cells)) < len(self._centres)
@@ -232,9 +229,10 @@ def to_surface_map(grid: GridMap) -> SurfaceMap:
 
     at = Grid(grid.p_occupied, grid.origin, grid.resolution)
     edge = _SQUARE * grid.resolution
-    with np.errstate(invalid="ignore"):
-        masks = grid.p_occupied > OCCUPIED_THRESH, grid.p_occupied < FREE_THRESH
-    squares = [np.floor(at.centres(np.argwhere(mask)) / edge).astype(np.int64) for mask in masks]
+    squares = [
+        np.floor(at.centres(np.argwhere(mask)) / edge).astype(np.int64)
+        for mask in (at.occupied, at.free)
+    ]
     both = np.concatenate(squares)
     low = both.min(axis=0) - 1
     shape = both.max(axis=0) + 2 - low
@@ -267,9 +265,7 @@ def _find_surfaces(grid: Grid, hits: NDArray[np.floating]) -> Float:
 def _free_runs(grid: Grid) -> tuple[Float, Float]:
     """Runs of free cells along the rows: (R, 3, 3) poses of their begins, whose x axis is the row,
     and (R,) m."""
-    with np.errstate(invalid="ignore"):
-        free = grid.p_occupied < FREE_THRESH
-    padded = np.pad(free, [(0, 0), (1, 1)]).astype(np.int8)
+    padded = np.pad(grid.free, [(0, 0), (1, 1)]).astype(np.int8)
     row, first = np.nonzero(np.diff(padded, axis=1) == 1)
     _, last = np.nonzero(np.diff(padded, axis=1) == -1)
     begins = grid.centres(np.stack([row, first], axis=1))

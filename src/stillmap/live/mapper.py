@@ -215,14 +215,11 @@ class LiveMapper:
         history = slam.history
         if not history.kept:
             raise InputError("no scan could be kept: the disk was full")
+        recording, p_static = history.recording(), history.labels()
+        given, (poses, submap) = history.notes()["pose"].copy(), slam.placement()
+        kept_map = slam.keep_map() if self._mode == "extend" else None
         return Snapshot(
-            history.recording(),
-            history.notes()["pose"].copy(),
-            history.labels(),
-            *slam.placement(),
-            self.options,
-            history.folder,
-            slam.keep_map() if self._mode == "extend" else None,
+            recording, given, p_static, poses, submap, self.options, history.folder, kept_map
         )
 
     def move_folder(self, folder: Path) -> None:

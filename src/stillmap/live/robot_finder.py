@@ -55,11 +55,7 @@ class RobotFinder:
     """
 
     def __init__(
-        self,
-        place: Localizer | None,
-        labels: CausalLabels,
-        odometry: LiveOdometry,
-        frame: MapFrame,
+        self, place: Localizer | None, labels: CausalLabels, odometry: LiveOdometry, frame: MapFrame
     ) -> None:
         self._place, self._labels, self._odometry, self._frame = place, labels, odometry, frame
         self._carried: OwnMap | None = None

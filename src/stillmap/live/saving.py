@@ -147,11 +147,10 @@ class Snapshot(ShortRepr):
         large = np.flatnonzero(counts >= _MIN_SCANS).tolist()
         return main, [number for number in large if number != main]
 
-    def _take(self, submap: int, source: Source | None = None) -> "Snapshot":
+    def _take(self, submap: int, source: Source) -> "Snapshot":
         """The scans of a submap; `source` instead of that of the recording."""
-        scans, recording = np.flatnonzero(self.submap == submap), self.recording
-        if source is not None:
-            recording = replace(recording, source=source)
+        scans = np.flatnonzero(self.submap == submap)
+        recording = replace(self.recording, source=source)
         if len(scans) == recording.n_scans:
             return replace(self, recording=recording)
         counts = np.diff(recording.offset)
@@ -170,14 +169,9 @@ class Snapshot(ShortRepr):
             T_odom_base=None if odometry is None else odometry[scans],
             beam_time=None if times is None else take(times),
         )
-        return replace(
-            self,
-            recording=taken,
-            given=self.given[scans],
-            p_static=take(self.p_static),
-            poses=self.poses[scans],
-            submap=self.submap[scans],
-        )
+        given, poses, p_static = self.given[scans], self.poses[scans], take(self.p_static)
+        kept = replace(self, given=given, p_static=p_static, poses=poses)
+        return replace(kept, recording=taken, submap=self.submap[scans])
 
     def _map(self, progress: Progress = no_progress, *, refine: bool = False) -> MappingResult:
         poses, scratch = None if refine else self.poses, self.recording.scratch

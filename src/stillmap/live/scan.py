@@ -16,13 +16,7 @@ from stillmap.core.arrays import finite_rows
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.timestamps import MAX_BEAM_TIME
-from stillmap.io.from_arrays import (
-    poses_to_matrices,
-    require_all,
-    require_length,
-    stamps_to_ns,
-    to_array,
-)
+from stillmap.io import from_arrays
 from stillmap.io.trajectory import MAX_MOUNT
 from stillmap.prepare.max_range import MAX_ZERO_RANGE
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
@@ -118,7 +112,7 @@ def to_beams(scan: Scan) -> ScanBeams:
     Raises:
         ValueError: names the argument, what was expected, and what it was.
     """
-    stamp_ns = int(stamps_to_ns(np.atleast_1d(np.asarray(scan.stamp)))[0])
+    stamp_ns = int(from_arrays.stamps_to_ns(np.atleast_1d(np.asarray(scan.stamp)))[0])
     if scan.points is None:
         points, hit = _from_ranges(scan)
     else:
@@ -126,10 +120,10 @@ def to_beams(scan: Scan) -> ScanBeams:
     D = points.shape[1]
     times = scan.beam_times
     if times is not None:
-        times = to_array("beam_times", times, "(N,)").astype(np.float32)
-        require_length("beam_times", len(times), len(points), "the beams")
+        times = from_arrays.to_array("beam_times", times, "(N,)").astype(np.float32)
+        from_arrays.require_length("beam_times", len(times), len(points), "the beams")
         good = np.abs(times) <= MAX_BEAM_TIME
-        require_all("beam_times", good, f"up to {MAX_BEAM_TIME:g} s", times)
+        from_arrays.require_all("beam_times", good, f"up to {MAX_BEAM_TIME:g} s", times)
     pose = _sensor_matrix(scan.sensor_pose, D)
     return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
 
@@ -176,9 +170,9 @@ def deskew(beams: ScanBeams, twist: Float) -> ScanBeams:
 def _from_ranges(scan: Scan) -> tuple[Float32, Bool]:
     if scan.ranges is None or scan.angles is None:
         raise ValueError("scan: expected ranges and angles, or points")
-    ranges = to_array("ranges", scan.ranges, "(N,)").astype(np.float64)
-    angles = to_array("angles", scan.angles, "(N,)").astype(np.float64)
-    require_length("angles", len(angles), len(ranges), "ranges")
+    ranges = from_arrays.to_array("ranges", scan.ranges, "(N,)").astype(np.float64)
+    angles = from_arrays.to_array("angles", scan.angles, "(N,)").astype(np.float64)
+    from_arrays.require_length("angles", len(angles), len(ranges), "ranges")
     limit = MAX_PLAUSIBLE_RANGE if scan.max_range is None else scan.max_range
     beyond = ranges >= limit
     usable = beyond | (ranges >= max(scan.min_range, MAX_ZERO_RANGE))
@@ -201,7 +195,7 @@ def _from_points(scan: Scan) -> tuple[Float32, Bool]:
     hit = usable
     if scan.hit is not None:
         given = np.asarray(scan.hit, np.bool_)
-        require_length("hit", len(given), len(points), "points")
+        from_arrays.require_length("hit", len(given), len(points), "points")
         hit = usable & given
     if scan.max_range is None:
         return points, hit
@@ -213,7 +207,8 @@ def _from_points(scan: Scan) -> tuple[Float32, Bool]:
 def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
     if pose is None:
         return np.eye(dimension + 1)
-    out: Float = poses_to_matrices("sensor_pose", np.asarray(pose)[None], 1, dimension)[0]
+    poses = np.asarray(pose)[None]
+    out: Float = from_arrays.poses_to_matrices("sensor_pose", poses, 1, dimension)[0]
     if not np.hypot.reduce(out[:dimension, dimension]) <= MAX_MOUNT:
         raise ValueError(f"sensor_pose: expected at most {MAX_MOUNT:.0f} m from the robot's base")
     return out

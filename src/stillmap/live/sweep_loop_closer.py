@@ -89,7 +89,7 @@ class LiveSweepLoopCloser:
     """
 
     def __init__(self, options: SlamOptions, folder: Path | None, threads: int) -> None:
-        self._is_enabled, self._threads = options.loop_closure, threads
+        self._threads = threads
         self._scans = SpacedScans(3, options, folder)
         self._found: list[LoopClosure] = []
         self._search = LoopSearch(0)
@@ -104,7 +104,7 @@ class LiveSweepLoopCloser:
     def poll(self) -> Correction | None:
         """Search loops of the keyframes since the last search; None: nothing changed."""
         first, last = self._searched, len(self._scans)
-        if not self._is_enabled or first == last:
+        if first == last:
             return None
         context = self._scans.context(np.arange(last))
         # the first keyframes after the robot was carried
@@ -168,15 +168,9 @@ class LiveSweepLoopCloser:
         odometry = LidarOdometry(poses, np.zeros((n, 6)), np.zeros((n, 6, 6)), context.explained)
         # loops lead back to all from before, in a wide window; and no submap has both places
         apart = _CARRIED_TRAVEL * np.cumsum(np.isin(context.keyframes, carried))
-        return SweepLoopCloser(
-            context.recording,
-            context.e,
-            odometry,
-            context.travelled + apart,
-            context.keyframes,
-            context.search_distance,
-            self._threads,
-        )
+        sweeps = context.recording, context.e, odometry, context.travelled + apart
+        distance = context.search_distance
+        return SweepLoopCloser(*sweeps, context.keyframes, distance, self._threads)
 
 
 def _find_untied(carried: Sequence[int], closures: Sequence[LoopClosure]) -> tuple[int, ...]:
