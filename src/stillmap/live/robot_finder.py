@@ -92,9 +92,9 @@ class RobotFinder:
     def lose(self, scan: int) -> None:
         """The robot was carried before a scan: the labels begin anew, until it is found."""
         self._begin_stretch(scan)
-        labels, left_behind = self._labels, self._odometry.left_behind
         if self._carried is None:
             self._frame.go_on(to_the_end=True)
+        labels, left_behind = self._labels, self._odometry.left_behind
         if self._search is not None:
             self._search.forget(labels)
             self._search.is_lost = True
