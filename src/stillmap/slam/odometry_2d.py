@@ -108,9 +108,8 @@ class _ScanOdometry:
         if has_map:
             match, poor = front_end.match(grid, scan, s, prior, learned, alternative)
             poor = poor and is_seen
-        is_off = poor or is_inconsistent(learned or prior, match.T_map_base)
         after_gap = is_gap(seconds, self.seconds, (learned or prior).translation_std)
-        if is_off and after_gap and self.search_wider:
+        if after_gap and self.search_wider and not front_end.confirms(learned or prior, match, s):
             # one scan that fits somewhere near does not say where the robot went, or was carried,
             # while nothing was recorded: all that follow decide
             self._start_segment(t, learned or prior)

@@ -188,6 +188,13 @@ def select_beams(
     )
 
 
+def select_scans(recording: Recording, e: Float32, scans: Index) -> tuple[Recording, Float32]:
+    """Some scans (n,), rising, of a planar recording as `thin_scans` leaves it, and their e."""
+    beams, odometry = beams_of_scans(recording, scans, _MAX_BEAMS), recording.T_odom_base
+    of_scans = select_beams(recording, scans, beams, None if odometry is None else odometry[scans])
+    return of_scans, e[np.concatenate(beams)]
+
+
 def thin_scans(recording: Recording, values: Values) -> tuple[Recording, Values]:
     """A planar recording with fewer beams in the scans that have more than registration needs.
 

@@ -28,7 +28,7 @@ _MAX_WINDOW = 100.0  # m, half width of a search window, whatever odometry claim
 _SEARCH_STDS = 3.0  # half width of the search window in standard deviations of the prior
 # of the usual explained share: enough for the optimum next to odometry; too little without a wider
 # search
-_LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
+LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
 # m, rad: half widths of the wider searches, at least
 _WIDE_WINDOWS = (0.5, 0.5), (1.5, math.pi)
 MIN_GAIN = 7.0  # nats that a pose must gain outside the learned noise of odometry
@@ -192,7 +192,7 @@ def _match_within_prior(
     if not prior.is_odometry:
         return _search_window(grid, scan, prior)
     local = refine_pose(grid, scan, prior, prior.T_map_base)
-    if local.explained >= _LOCAL_SHARE * usual:
+    if local.explained >= LOCAL_SHARE * usual:
         return local
     matches = local, _search_window(grid, scan, prior)
     return min(matches, key=lambda match: match.cost + motion_cost(prior, match))

@@ -257,7 +257,8 @@ class _Comparison:
         for trajectory in (matched, alternative.replace_in(matched)):
             cost = self.odometry_cost(trajectory.poses, *span)
             for start, end in zip([first, *cuts], [*cuts, last], strict=True):
-                cost += self._scan_cost(self._close_part(trajectory, start, end), start)
+                scans = self._kept_within(start, end)
+                cost += self._scan_cost(self._close_part(trajectory, scans), scans)
             costs.append(cost)
         return costs[0] - costs[1]
 
@@ -266,9 +267,10 @@ class _Comparison:
     ) -> float:
         """The same of two trajectories with loops closed, the latter with the alternative."""
         first, last = _window(self.travelled, alternative.a, alternative.b, _COMPARED)
+        scans = self._kept_within(first, last)
         cost, cost_after = (
             self.odometry_cost(closed.poses, first + 1, last)
-            + self._scan_cost(closed.poses[first:last], first)
+            + self._scan_cost(closed.poses[scans], scans)
             for closed in (before, after)
         )
         return cost - cost_after
@@ -276,32 +278,32 @@ class _Comparison:
     def cost(self, closed: MStepResult) -> float:
         """Nats, -ln of the probability of all scans and steps, up to a constant."""
         poses = closed.poses
-        return self.odometry_cost(poses, 1, len(poses)) + self._scan_cost(poses, 0)
+        kept = self.kept
+        return self.odometry_cost(poses, 1, len(poses)) + self._scan_cost(poses[kept], kept)
 
-    def _scan_cost(self, poses: Float, first: int) -> float:
-        """-ln of the evidence of the map of spaced scans from `first` on at poses (n, 3, 3)."""
-        within = np.searchsorted(self.kept, [first, first + len(poses)])
-        scans = self.kept[slice(*within)]
-        grid = scan_hits.count_beams(
-            self.recording, self.e, scans, poses[scans - first], self.options.resolution
-        )
+    def _kept_within(self, first: int, last: int) -> Index:
+        """The spaced scans from first to last - 1."""
+        return self.kept[slice(*np.searchsorted(self.kept, [first, last]))]
+
+    def _scan_cost(self, poses: Float, scans: Index) -> float:
+        """-ln of the evidence of the map of scans (n,) at poses (n, 3, 3)."""
+        grid = scan_hits.count_beams(self.recording, self.e, scans, poses, self.options.resolution)
         return -map_evidence(grid)
 
-    def _close_part(self, trajectory: MStepResult, first: int, last: int) -> Float:
-        """Poses of the scans from first to last - 1 with the loops among them closed."""
-        matched = self._part(trajectory, first, last)
-        return self.methods.close_part(*self._select(first, last), matched).poses
-
-    def _part(self, trajectory: MStepResult, first: int, last: int) -> MStepResult:
-        """The scans from first to last - 1, without what is known of other scans."""
-        scans = slice(first, last)
-        return MStepResult(
+    def _close_part(self, trajectory: MStepResult, scans: Index) -> Float:
+        """Poses of scans (n,) with the loops among them closed."""
+        if not len(scans):
+            return trajectory.poses[scans]
+        drift = trajectory.drift
+        matched = MStepResult(
             trajectory.poses[scans],
             trajectory.covariance[scans],
             trajectory.grid,
             trajectory.explained[scans],
-            None if trajectory.drift is None else trajectory.drift[scans],
+            None if drift is None else np.diff(drift.cumsum(axis=0)[scans], axis=0, prepend=0.0),
         )
+        part, e = scan_hits.select_scans(self.recording, self.e, scans)
+        return self.methods.close_part(part, e, matched).poses
 
     def _select(self, first: int, last: int) -> tuple[Recording, Float32]:
         """The scans from first to last - 1 and the e of their beams."""
