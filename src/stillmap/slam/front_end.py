@@ -114,7 +114,9 @@ class FrontEnd:
     def confirms(self, prior: MotionPrior, match: ScanMatch, sensor: str | int) -> bool:
         """True if a scan fits where its prior leads as well as scans of that sensor usually do."""
         is_near = not scan_matching.is_inconsistent(prior, match.T_map_base)
-        return is_near and match.explained >= scan_matching.LOCAL_SHARE * self.usual.get(sensor, 1.0)
+        return is_near and match.explained >= scan_matching.LOCAL_SHARE * self.usual.get(
+            sensor, 1.0
+        )
 
     def search_wider(
         self,
