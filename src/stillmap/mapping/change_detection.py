@@ -266,7 +266,7 @@ def _split_by_time(events: _Events, cells: Cells, resolution: float) -> list[Cha
         if np.count_nonzero(mine) >= _MIN_CELLS:
             kind: Kind = "came" if events.came[0] else "left"
             its = cells[np.unique(events.cell[mine])]
-            out.append(_make_change(kind, its, resolution, before, stamp, stamp, 1))
+            out.append(make_change(kind, its, resolution, before, stamp, stamp, 1))
         events = events.select(np.flatnonzero(~mine))
     return out
 
@@ -287,7 +287,7 @@ def _recurring_changes(
         last = int(stamps.first(bins[:, 1, 1]).max())
         times = int(np.median(changed.n_changes[chosen]))
         cells = changed.cells[chosen]
-        out.append(_make_change("comes and goes", cells, resolution, before, stamp, last, times))
+        out.append(make_change("comes and goes", cells, resolution, before, stamp, last, times))
     return out
 
 
@@ -303,7 +303,7 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
             if small and _within(larger.cells, change.cells, radius):
                 cells = np.unique(np.concatenate([larger.cells, change.cells]), axis=0)
                 times = (larger.before_ns, larger.stamp_ns, larger.last_ns, larger.times)
-                out[k] = _make_change(change.kind, cells, resolution, *times)
+                out[k] = make_change(change.kind, cells, resolution, *times)
                 break
         else:
             out.append(change)
@@ -336,9 +336,10 @@ def _remove_noise(changes: list[Change], unchanged: Cells) -> list[Change]:
     return out
 
 
-def _make_change(
+def make_change(
     kind: Kind, cells: Cells, resolution: float, before: int, stamp: int, last: int, times: int
 ) -> Change:
+    """The change of cells (K, D) in the box around them; stamps in ns."""
     low, high = cells.min(axis=0) * resolution, (cells.max(axis=0) + 1) * resolution
     x, y, *z = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
     size = tuple((high - low).tolist())

@@ -13,12 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 import stillmap._core as _core
-from stillmap.core.array_types import Bool, Cells, Float, Float32
-from stillmap.core.arrays import iter_blocks
-from stillmap.core.recording import Recording
+from stillmap.core.array_types import Bool, Cells, Float
 from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
-from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.doorways import Doorway, LoneLeaf
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.resting_leaf import SurfaceField
 
 _ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
@@ -231,26 +229,15 @@ _MIN_CELLS = 6
 _MIDDLE, _ANGLE = 4.0, 8  # cells, and parts of half a turn, by which lines of one leaf may differ
 
 
-def find_leaf_lines(
-    recording: Recording, poses: Float, p_static: Float32, resolution: float
-) -> list[Cells]:
-    """Cells (K, 2) of each straight row of dynamic hits that may be a leaf.
-
-    Args:
-        recording: 2D, M beams.
-        poses: (T, 3, 3) T_map_base.
-        p_static: (M,) of each beam.
-        resolution: m, edge of a cell.
-    """
+def find_leaf_lines(known: LabelledRecording) -> list[Cells]:
+    """Cells (K, 2) of each straight row of dynamic hits, in 2D, that may be a leaf."""
+    recording = known.recording
     lines: dict[tuple[int, ...], list[Cells]] = {}
-    for block in iter_blocks(recording.hit, p_static):
-        dynamic = recording.hit[block] & (p_static[block] < DYNAMIC_BELOW)
-        beam = block.start + np.flatnonzero(dynamic)
-        cells = np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)
+    for beam in known.iter_hits(dynamic=True):
         stamp = recording.stamp_ns[recording.scans_of(beam)]
         second = (stamp - recording.stamp_ns[0]) // _BIN_NS
-        seen = np.unique(np.column_stack([cells, second]), axis=0)
-        for place, line in _find_lines(seen, resolution) if len(seen) else ():
+        seen = np.unique(np.column_stack([known.end_cells(beam), second]), axis=0)
+        for place, line in _find_lines(seen, known.resolution) if len(seen) else ():
             lines.setdefault(place, []).append(line)
     return [np.unique(np.concatenate(parts), axis=0) for _, parts in sorted(lines.items())]
 

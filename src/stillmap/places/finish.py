@@ -19,7 +19,7 @@ from stillmap.core.local_frame import Fields, Shift, shift, shift_poses
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.io.trajectory import MAX_BYTES, write_tum
-from stillmap.mapping.beam_statistics import count_beams
+from stillmap.mapping.labelled_recording import count_beams
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry

@@ -1,11 +1,67 @@
-"""Counts and samples over all beams, block by block: recordings may be larger than memory."""
+"""Recordings with labels: cells, counts and samples of their beams.
+
+All go block by block: recordings may be larger than memory.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core.array_types import Bool, Float, Float32
+from stillmap import em
+from stillmap.core import arrays
+from stillmap.core.array_types import Bool, Cells, Float, Float32, Index, Int32
 from stillmap.core.arrays import iter_blocks
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
+
+
+class LabelledRecording(NamedTuple):
+    """A recording at known poses, P(static) of its beams, and the cells in which they are counted.
+
+    Attributes:
+        recording: T scans with M beams, deskewed.
+        poses: (T, D+1, D+1) T_map_base.
+        p_static: (M,) P(c = 1); NaN: unusable.
+        resolution: m, edge of a cell.
+        threads: number of threads; no result depends on it.
+    """
+
+    recording: Recording
+    poses: Float
+    p_static: Float32
+    resolution: float
+    threads: int = 1
+
+    def copy_labels(self) -> Float32:
+        """(M,) labels to be changed, memory-mapped where they are large."""
+        return arrays.copy(self.p_static, self.recording.scratch)
+
+    def end_cells(self, beams: Index) -> Cells:
+        """(n, D) cells in which ascending beams (n,) ended."""
+        ends = self.recording.end_points(beams, self.poses)
+        return np.floor(ends / self.resolution).astype(np.int64)
+
+    def iter_hits(self, dynamic: bool = False) -> Iterator[Index]:
+        """The beams (n,) that hit something, block by block; `dynamic`: with p_static < 0.5."""
+        for block in iter_blocks(self.recording.hit, self.p_static):
+            hit = self.recording.hit[block]
+            if dynamic:
+                hit = hit & (self.p_static[block] < DYNAMIC_BELOW)
+            yield block.start + np.flatnonzero(hit)
+
+    def iter_surfels(
+        self, histories: em.CellHistories, *release: Float32
+    ) -> Iterator[tuple[slice, Int32]]:
+        """Beams, and the surfel (n,) in which each ended, -1: none, chunk by chunk.
+
+        Args:
+            histories: with the surfels.
+            release: memory-mapped arrays whose pages are released after each chunk.
+        """
+        for _, beams, data in iter_beams(self.recording, self.poses, release=release):
+            yield beams, histories.surfel_map.associate_beams(*data, self.threads)
 
 
 def count_beams(hit: Bool, p_static: Float32) -> dict[str, int]:
