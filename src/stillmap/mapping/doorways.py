@@ -158,9 +158,7 @@ def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
         doorway: a gap in a wall.
         surface: (S, 2) occupied cells.
     """
-    middle, reach = doorway.ends.mean(axis=0), doorway.width + 14.0
-    near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
-    field = SurfaceField(near, middle, reach)
+    field = SurfaceField(surface, doorway.ends.mean(axis=0), doorway.width + 14.0)
     best: tuple[float, LoneLeaf | None] = 0.0, None
     u = (doorway.ends[1] - doorway.ends[0]) / doorway.width
     for v in (np.array([-u[1], u[0]]), np.array([u[1], -u[0]])):
@@ -192,10 +190,7 @@ def _rate_leaf(
         if hidden:
             more = np.arange(-1.0, hidden + _ASIDE[0])[:, None] * outwards
             row = np.concatenate([row, end + recess + more])
-    across = recess / np.linalg.norm(recess)
-    points = np.concatenate([row + k * across for k in (-1.0, 0.0, 1.0)])
-    cells = np.unique(np.round(points).astype(np.int64), axis=0)
-    return covered + exact, cells[field.sample(field.is_surface, cells)]
+    return covered + exact, field.cells_along(row, recess / np.linalg.norm(recess))
 
 
 def estimate_p_door(p_shut: Float, n_doors: int) -> Float:

@@ -17,15 +17,19 @@ from stillmap.core.array_types import Bool, Cells, Float
 from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
 from stillmap.mapping.doorways import Doorway, LoneLeaf
 from stillmap.mapping.labelled_recording import LabelledRecording
-from stillmap.mapping.resting_leaf import SurfaceField
+from stillmap.mapping.resting_leaf import (
+    MIN_COVERED,
+    MIN_EXACT,
+    NEAR_HINGE,
+    SurfaceField,
+    score_leaves,
+)
 
 _ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
 _SHIFT = np.array([-0.5, 1.0])  # cells of the hinge into the doorway
 _BACK = np.arange(-1.0, 6.0)  # cells of the hinge behind the face of the wall
 _LONGER = np.arange(-2.0, 5.0)  # cells by which the leaf is longer than the doorway is wide
-_MIN_COVERED, _MIN_EXACT = 0.85, 0.5  # share of the leaf within a cell of surface, and on it
-_MIN_CLEAR, _ASIDE = 0.85, 3.0  # share of the cells so far beside it that are none
-_NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
+_MIN_CLEAR = 0.85  # share of the cells beside the leaf that are none
 _BEYOND = (2.0, 5.0)  # cells beyond its end, which is free
 _NOISE = math.radians(15.0)  # of the swing beside either position
 _RADII = np.array([0.4, 0.55, 0.7, 0.85, 0.97])  # of the leaf, where the swing is looked at
@@ -49,19 +53,16 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
         doorway: a gap in a wall.
         surface: (S, 2) occupied cells.
     """
-    middle = doorway.ends.mean(axis=0)
-    reach = 2.0 * doorway.width + 12.0
-    near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
-    field = SurfaceField(near, middle, reach)
+    field = SurfaceField(surface, doorway.ends.mean(axis=0), 2.0 * doorway.width + 12.0)
     best: tuple[float, LoneLeaf | None] = 0.0, None
     for end, side in itertools.product((0, 1), (-1.0, 1.0)):
         rated = _rate_leaves(field, doorway, end, side)
         if rated is not None and rated[0] > best[0]:
             best = rated
     leaf = best[1]
-    if leaf is None or _goes_on(leaf, near):
+    if leaf is None or _goes_on(leaf, field.cells):
         return None
-    leaf = leaf._replace(roughness=_measure_roughness(leaf, near))
+    leaf = leaf._replace(roughness=_measure_roughness(leaf, field.cells))
     return leaf if leaf.roughness <= _ROUGHNESS + _MORE_ROUGHNESS else None
 
 
@@ -76,7 +77,7 @@ def _goes_on(leaf: LoneLeaf, surface: Cells) -> bool:
 def _measure_roughness(leaf: LoneLeaf, surface: Cells) -> float:
     """Standard deviation of the surface of a leaf from a line, cells."""
     along, across = _along_and_across(leaf, surface)
-    of_leaf = (along > _NEAR_HINGE * leaf.length) & (along < leaf.length)
+    of_leaf = (along > NEAR_HINGE * leaf.length) & (along < leaf.length)
     of_leaf &= np.abs(across) <= _BAND
     line = np.column_stack([along[of_leaf], np.ones(np.count_nonzero(of_leaf))])
     fitted = line @ np.linalg.lstsq(line, across[of_leaf], rcond=None)[0]
@@ -101,7 +102,7 @@ def is_thin(leaf: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
     across = np.array([-leaf.leaf[1], leaf.leaf[0]])
     if across @ leaf.shut < 0.0:
         across = -across
-    t = np.arange(_NEAR_HINGE * leaf.length + 1.0, leaf.length)
+    t = np.arange(NEAR_HINGE * leaf.length + 1.0, leaf.length)
     row = leaf.hinge + t[:, None] * leaf.leaf
     inside, behind = (
         max(_passed_share(counts, row + k * side * across) for k in _BESIDE) for side in (1.0, -1.0)
@@ -118,21 +119,16 @@ def _passed_share(counts: _core.OccupancyGrid2D, points: Float) -> float:
 
 
 class _Hypotheses(NamedTuple):
-    """H leaves of any length at one end of a doorway, sampled at every cell along them, N of them.
+    """H leaves of any length at one end of a doorway.
 
     Attributes:
         hinge, leaf: (H, 2).
         angle: (H,) rad from the doorway.
-        row: (H, N, 2) cells along each.
-        is_near, is_on: (H, N) whether they are within a cell of surface, and on it.
     """
 
     hinge: Float
     leaf: Float
     angle: Float
-    row: Float
-    is_near: Bool
-    is_on: Bool
 
     def select(self, kept: Bool) -> "_Hypotheses":
         return _Hypotheses._make(column[kept] for column in self)
@@ -144,23 +140,20 @@ def _rate_leaves(
     """Score and shape of the best leaf hinged at one end of a doorway, towards one side of it."""
     u = (doorway.ends[1 - end] - doorway.ends[end]) / doorway.width
     v = side * np.array([-u[1], u[0]])
-    t = _along(doorway)
     every = _sample_leaves(field, doorway, doorway.ends[end], u, v)
-    if every is not None:
-        every = every.select(_swept_share(field, doorway.width, every, u, v) <= _MAX_SWEPT)
-    if every is None or not len(every.hinge):
+    every = every.select(_swept_share(field, doorway.width, every, u, v) <= _MAX_SWEPT)
+    if not len(every.hinge):
         return None
-    across = every.leaf[:, ::-1] * [-1.0, 1.0]
-    rows = [every.row + k * across[:, None] for k in np.arange(-_ASIDE, _ASIDE + 1.0)]
-    aside = np.stack([field.sample(field.is_surface, row) for row in rows])
     best: tuple[float, LoneLeaf] | None = None
     for length in doorway.width + _LONGER:
-        score = _score_leaves(every, aside, t, length)
+        t = _count_up(length + _BEYOND[1])
+        points = every.hinge[:, None] + t[:, None] * every.leaf[:, None]
+        row, beyond = points[:, t <= length], points[:, t >= length + _BEYOND[0]]
+        is_far = t[t <= length] >= NEAR_HINGE * length
+        score = score_leaves(field, row, beyond, every.leaf, is_far, _MIN_CLEAR)
         k = int(score.argmax())
         if score[k] > (best[0] if best else 0.0):
-            points = [every.row[k, t <= length] + j * across[k] for j in (-1.0, 0.0, 1.0)]
-            cells = np.unique(np.round(np.concatenate(points)).astype(np.int64), axis=0)
-            cells = cells[field.sample(field.is_surface, cells)]
+            cells = field.cells_along(row[k], every.leaf[k, ::-1] * [-1.0, 1.0])
             cells = cells[(cells - doorway.ends[end]) @ v > _JAMB]
             best = float(score[k]), LoneLeaf(every.hinge[k], length, u, every.leaf[k], cells)
     return best
@@ -168,47 +161,23 @@ def _rate_leaves(
 
 def _sample_leaves(
     field: SurfaceField, doorway: Doorway, end: Float, u: Float, v: Float
-) -> _Hypotheses | None:
-    """Those that lie on surface over the shortest length; None: there are none."""
+) -> _Hypotheses:
+    """Those that lie on surface over the shortest length."""
     grids = np.meshgrid(_SHIFT, _BACK, _ANGLES, indexing="ij")
     shift, back, angle = (grid.ravel() for grid in grids)
     hinge = end + shift[:, None] * u + back[:, None] * v
     leaf = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
-    t = _along(doorway)
-    least = t[t <= doorway.width + _LONGER[0]]
+    least = _count_up(doorway.width + _LONGER[0])
     kept = np.arange(len(angle))
-    for layer, share in ((field.is_near, _MIN_COVERED), (field.is_surface, _MIN_EXACT)):
+    for layer, share in ((field.is_near, MIN_COVERED), (field.is_surface, MIN_EXACT)):
         row = hinge[kept, None] + least[:, None] * leaf[kept, None]
         kept = kept[field.sample(layer, row).mean(axis=1) >= share]
-    if not len(kept):
-        return None
-    row = hinge[kept, None] + t[:, None] * leaf[kept, None]
-    is_near, is_on = (field.sample(layer, row) for layer in (field.is_near, field.is_surface))
-    return _Hypotheses(hinge[kept], leaf[kept], angle[kept], row, is_near, is_on)
+    return _Hypotheses(hinge[kept], leaf[kept], angle[kept])
 
 
-def _along(doorway: Doorway) -> Float:
-    """(N,) cells from the hinge, as far as leaves are looked at."""
-    return np.arange(1.0, doorway.width + _LONGER[-1] + _BEYOND[1])
-
-
-def _score_leaves(every: _Hypotheses, aside: Bool, t: Float, length: float) -> Float:
-    """(H,) score of the leaves of one length; 0 where there is none.
-
-    Args:
-        every: H leaves.
-        aside: (A, H, N) surface in rows beside them, from one side to the other.
-        t: (N,) cells from the hinge.
-        length: cells.
-    """
-    on = t <= length
-    far = on & (t >= _NEAR_HINGE * length)
-    beyond = (t >= length + _BEYOND[0]) & (t <= length + _BEYOND[1])
-    covered, exact = every.is_near[:, on].mean(axis=1), every.is_on[:, on].mean(axis=1)
-    clear = 1.0 - aside[[0, -1]][:, :, far].mean(axis=2).max(axis=0)
-    good = ~aside[:, :, beyond].any(axis=(0, 2)) & (clear >= _MIN_CLEAR)
-    good &= (covered >= _MIN_COVERED) & (exact >= _MIN_EXACT)
-    return np.where(good, covered + exact + clear, 0.0)
+def _count_up(last: float) -> Float:
+    """(N,) 1, 2, ... up to `last`: cells from the hinge."""
+    return np.arange(1.0, math.floor(last) + 1.0)
 
 
 def _swept_share(
