@@ -15,7 +15,7 @@ from stillmap.core.segments import segments_meet_box
 from stillmap.em import GroundMap
 from stillmap.mesh.range_image import has_planar_scans
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import HOLD, MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box, fit_box
+from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box, fit_box
 
 OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
 _OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin
@@ -68,7 +68,7 @@ def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedB
     for one in objects:
         assert one.z is not None
         height = float(one.size[2])
-        boxes.append(TrackedBox(fit_box(one, start_ns, HOLD), one.z - 0.5 * height, height))
+        boxes.append(TrackedBox(fit_box(one, start_ns), one.z - 0.5 * height, height))
     return boxes
 
 
