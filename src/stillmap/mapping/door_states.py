@@ -82,7 +82,7 @@ def _list_observations(hits: Int64, stamp_ns: Int64, least: float) -> Int64:
 
 def _list_states(door: Door, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
-    out: list[DoorState] = []
+    seen: list[DoorState] = []
     counts, contradicted = {"shut": 0, "open": 0}, 0
     bins = (stamp_ns[hits[:, 0]] - stamp_ns[0]) // _BIN_NS
     for second in group_indices(bins):
@@ -97,12 +97,10 @@ def _list_states(door: Door, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, .
             continue
         counts[position] += 1
         first, last = int(stamp_ns[scans.min()]), int(stamp_ns[scans.max()])
-        if out and out[-1].position == position:
-            first = out.pop().since_ns
-        out.append(DoorState(position, first, last))
+        seen.append(DoorState(position, first, last))
     # a single one may be of somebody who walks by; a leaf is not in two positions
     swings = min(counts.values()) >= max(_MIN_OBSERVATIONS, contradicted)
-    return tuple(out) if swings else ()
+    return _join_runs(seen) if swings else ()
 
 
 def is_passage_observed(door: Door, known: LabelledRecording) -> bool:
@@ -168,8 +166,13 @@ def list_runs(position: Position, observations: Int64, passages: Int64) -> tuple
     opposite: Position = "shut" if position == "open" else "open"
     seen = [DoorState(position, first, last) for first, last in observations.tolist()]
     seen += [DoorState(opposite, stamp, stamp) for stamp in passages.tolist()]
+    return _join_runs(sorted(seen, key=lambda state: state.since_ns))
+
+
+def _join_runs(seen: Sequence[DoorState]) -> tuple[DoorState, ...]:
+    """States with those of one position that follow each other joined."""
     out: list[DoorState] = []
-    for state in sorted(seen, key=lambda state: state.since_ns):
+    for state in seen:
         same = bool(out) and out[-1].position == state.position
         out.append(state._replace(since_ns=out.pop().since_ns) if same else state)
     return tuple(out)

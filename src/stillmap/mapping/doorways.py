@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core.array_types import Cells, Float, Index
-from stillmap.mapping.doors import Door
+from stillmap.mapping.doors import Door, measure_states
 from stillmap.mapping.resting_leaf import SurfaceField
 
 _DIRECTIONS = 60  # of half a turn, of which walls may have some
@@ -129,6 +129,7 @@ class LoneLeaf(NamedTuple):
         shut, leaf: (2,) unit directions from the hinge to the other end of the doorway, and along
             the leaf.
         cells: (K, 2) of it, without those at the edge of the wall.
+        is_open: in which position it was.
         roughness: cells, standard deviation of its surface from a line; 0 of a shut one.
     """
 
@@ -137,6 +138,7 @@ class LoneLeaf(NamedTuple):
     shut: Float
     leaf: Float
     cells: Cells
+    is_open: bool
     roughness: float = 0.0
 
 
@@ -166,7 +168,7 @@ def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
             score, cells = _rate_leaf(field, doorway, u, back * v)
             if score > best[0]:
                 hinge = doorway.ends[0] + back * v
-                best = score, LoneLeaf(hinge, doorway.width, u, u, cells)
+                best = score, LoneLeaf(hinge, doorway.width, u, u, cells, False)
     return best[1]
 
 
@@ -214,7 +216,6 @@ def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
 
 def estimate_shut_share(doors: Sequence[Door]) -> float:
     """Share of the time for which doors are shut, by those that were seen to swing."""
-    seconds = {"open": 0.5 * _PRIOR_SECONDS, "shut": 0.5 * _PRIOR_SECONDS}
-    for state in (state for door in doors for state in door.states):
-        seconds[state.position] += 1e-9 * (state.until_ns - state.since_ns)
-    return seconds["shut"] / (seconds["open"] + seconds["shut"])
+    lasts = measure_states(state for door in doors for state in door.states)
+    shut, whole = (1e-9 * span for span in (lasts["shut"], sum(lasts.values())))
+    return (0.5 * _PRIOR_SECONDS + shut) / (_PRIOR_SECONDS + whole)

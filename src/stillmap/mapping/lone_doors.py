@@ -15,14 +15,7 @@ from stillmap import em
 from stillmap.core.array_types import Cells, Float, Float32, Index, Int64
 from stillmap.core.chunks import iter_beams
 from stillmap.core.square_box import cell_keys
-from stillmap.mapping.door_states import (
-    INNER,
-    find_hit_cells,
-    list_runs,
-    measure_slope,
-    observe_leaves,
-    observe_passages,
-)
+from stillmap.mapping import door_states
 from stillmap.mapping.doors import Door, DoorState
 from stillmap.mapping.doorways import (
     LoneLeaf,
@@ -124,17 +117,17 @@ def find_lone_doors(surface: Cells, doors: Sequence[Door], known: LabelledRecord
         return []
     counts = _count_beams(known)
     free = [doorway for doorway in doorways if is_doorway_free(doorway, counts)]
-    found = [(find_open_leaf(doorway, surface), True) for doorway in free]
-    found += [(find_shut_leaf(doorway, surface), False) for doorway in free]
-    taken = [door.swept_cells for door in doors]
-    leaves: list[tuple[LoneLeaf, bool]] = []
-    for leaf, is_open in found:
+    found = [
+        find(doorway, surface) for find in (find_open_leaf, find_shut_leaf) for doorway in free
+    ]
+    taken, leaves = [door.swept_cells for door in doors], list[LoneLeaf]()
+    for leaf in found:
         if leaf is None or not len(leaf.cells):  # of coarse cells, all may be at the wall
             continue
-        is_leaf = not is_open or is_thin(leaf, counts)
+        is_leaf = not leaf.is_open or is_thin(leaf, counts)
         if is_leaf and not any(_is_part(leaf.cells, cells) for cells in taken):
             taken.append(leaf.cells)
-            leaves.append((leaf, is_open))
+            leaves.append(leaf)
     return _observe(leaves, doors, known)
 
 
@@ -154,20 +147,20 @@ def _count_beams(known: LabelledRecording) -> _core.OccupancyGrid2D:
 
 
 def _observe(
-    leaves: Sequence[tuple[LoneLeaf, bool]], doors: Sequence[Door], known: LabelledRecording
+    leaves: Sequence[LoneLeaf], doors: Sequence[Door], known: LabelledRecording
 ) -> list[Door]:
-    """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
+    """The doors with these leaves, when they were seen, and P(moved)."""
     stamp_ns = known.recording.stamp_ns
-    observations = observe_leaves([leaf.cells for leaf, _ in leaves], known)
+    observations = door_states.observe_leaves([leaf.cells for leaf in leaves], known)
     passed_doors, lone_doors, lone_observations = list[Door](), list[Door](), list[Int64]()
-    for (leaf, is_open), seen in zip(leaves, observations, strict=True):
+    for leaf, seen in zip(leaves, observations, strict=True):
         if not len(seen):
             continue
         passed = np.empty(0, np.intp)
-        if not is_open:
+        if not leaf.is_open:
             leaf, passed = _find_passages(leaf, seen, known)
-        states = list_runs("open" if is_open else "shut", seen, stamp_ns[passed])
-        door = _make_door(leaf, is_open, known.resolution, states)
+        states = door_states.list_runs("open" if leaf.is_open else "shut", seen, stamp_ns[passed])
+        door = _make_door(leaf, known.resolution, states)
         if len(passed):
             passed_doors.append(door)
         else:
@@ -186,14 +179,16 @@ def _find_passages(
     is it one if the surface that was seen there does not lie along the doorway.
     """
     ends = known.resolution * (leaf.hinge + 0.5 + np.outer([0.0, leaf.length], leaf.shut))
-    scans = observe_passages(ends, observations, known)
-    hit = find_hit_cells(scans, known)
+    scans = door_states.observe_passages(ends, observations, known)
+    hit = door_states.find_hit_cells(scans, known)
     moved = leaf._replace(cells=leaf.cells[~np.isin(cell_keys(leaf.cells), cell_keys(hit))])
     along = np.round((moved.cells - leaf.hinge) @ leaf.shut)
-    inner = np.arange(math.ceil(INNER[0] * leaf.length), INNER[1] * leaf.length)
+    inner = np.arange(
+        math.ceil(door_states.INNER[0] * leaf.length), door_states.INNER[1] * leaf.length
+    )
     if np.isin(inner, along).mean() < _MIN_MOVED:
         return leaf, scans[:0]
-    if not abs(measure_slope(ends, observations, known)) <= _MAX_SLOPE:
+    if not abs(door_states.measure_slope(ends, observations, known)) <= _MAX_SLOPE:
         return leaf, scans[:0]
     return moved, scans
 
@@ -217,18 +212,16 @@ def _is_part(cells: Cells, others: Cells) -> bool:
     return bool(np.isin(cell_keys(cells), cell_keys(others)).mean() > _MAX_COMMON)
 
 
-def _make_door(
-    leaf: LoneLeaf, is_open: bool, resolution: float, states: tuple[DoorState, ...]
-) -> Door:
+def _make_door(leaf: LoneLeaf, resolution: float, states: tuple[DoorState, ...]) -> Door:
     x, y = ((leaf.hinge + 0.5) * resolution).tolist()
     none = np.empty((0, 2), np.int64)
     return Door(
         hinge=(x, y),
         length=leaf.length * resolution,
         shut=math.atan2(leaf.shut[1], leaf.shut[0]),
-        opened=math.atan2(leaf.leaf[1], leaf.leaf[0]) if is_open else math.nan,
-        shut_cells=none if is_open else leaf.cells,
-        open_cells=leaf.cells if is_open else none,
+        opened=math.atan2(leaf.leaf[1], leaf.leaf[0]) if leaf.is_open else math.nan,
+        shut_cells=none if leaf.is_open else leaf.cells,
+        open_cells=leaf.cells if leaf.is_open else none,
         swept_cells=leaf.cells,
         states=states,
         p_moved=_P_PASSED,

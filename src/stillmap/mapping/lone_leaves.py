@@ -155,7 +155,7 @@ def _rate_leaves(
         if score[k] > (best[0] if best else 0.0):
             cells = field.cells_along(row[k], every.leaf[k, ::-1] * [-1.0, 1.0])
             cells = cells[(cells - doorway.ends[end]) @ v > _JAMB]
-            best = float(score[k]), LoneLeaf(every.hinge[k], length, u, every.leaf[k], cells)
+            best = float(score[k]), LoneLeaf(every.hinge[k], length, u, every.leaf[k], cells, True)
     return best
 
 
