@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stillmap.core.array_types import Cells, Float, Index, Int64
+from stillmap.core.arrays import expand_ranges
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import cell_keys, group_indices
 from stillmap.mapping.doors import Door, DoorState, Position
@@ -199,9 +200,7 @@ def find_hit_cells(scans: Index, known: LabelledRecording) -> Cells:
 
 def _list_hits(scans: Index, recording: Recording) -> tuple[Index, Index]:
     """(n,) beams of some scans that hit something, and which of these scans they are of."""
-    first, count = recording.offset[scans], np.diff(recording.offset)[scans]
-    of = np.repeat(np.arange(len(scans)), count)
-    beam = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + first[of]
+    of, beam = expand_ranges(recording.offset[scans], np.diff(recording.offset)[scans])
     hit = recording.hit[beam]
     return beam[hit], of[hit]
 

@@ -43,13 +43,9 @@ class LabelledRecording(NamedTuple):
         ends = self.recording.end_points(beams, self.poses)
         return np.floor(ends / self.resolution).astype(np.int64)
 
-    def iter_hits(self, dynamic: bool = False) -> Iterator[Index]:
-        """The beams (n,) that hit something, block by block; `dynamic`: with p_static < 0.5."""
-        for block in iter_blocks(self.recording.hit, self.p_static):
-            hit = self.recording.hit[block]
-            if dynamic:
-                hit = hit & (self.p_static[block] < DYNAMIC_BELOW)
-            yield block.start + np.flatnonzero(hit)
+    def iter_hits(self, dynamic: bool | None = None) -> Iterator[Index]:
+        """See the function."""
+        return iter_hits(self.recording.hit, self.p_static, dynamic)
 
     def iter_surfels(
         self, histories: em.CellHistories, *release: Float32
@@ -62,6 +58,21 @@ class LabelledRecording(NamedTuple):
         """
         for _, beams, data in iter_beams(self.recording, self.poses, release=release):
             yield beams, histories.surfel_map.associate_beams(*data, self.threads)
+
+
+def iter_hits(hit: Bool, p_static: Float32, dynamic: bool | None = None) -> Iterator[Index]:
+    """The beams (n,) that hit something, block by block.
+
+    Args:
+        hit: (M,) whether a beam ended on something.
+        p_static: (M,).
+        dynamic: only those with p_static < 0.5, or only the others; None: all.
+    """
+    for block in iter_blocks(hit, p_static):
+        chosen = hit[block]
+        if dynamic is not None:
+            chosen = chosen & ((p_static[block] < DYNAMIC_BELOW) == dynamic)
+        yield block.start + np.flatnonzero(chosen)
 
 
 def count_beams(hit: Bool, p_static: Float32) -> dict[str, int]:
@@ -104,20 +115,14 @@ def sample_points(
     Returns:
         (K, D) metres, in the recording's order, K <= limit.
     """
-    arrays = recording.hit, p_static
-
-    def is_chosen(block: slice) -> Bool:
-        moves = p_static[block] < DYNAMIC_BELOW
-        return recording.hit[block] & (moves if dynamic else ~moves)
-
-    counts = [int(np.count_nonzero(is_chosen(block))) for block in iter_blocks(*arrays)]
+    counts = [len(hits) for hits in iter_hits(recording.hit, p_static, dynamic)]
     total = sum(counts)
     kept = min(total, limit)
     chosen = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
     before = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     parts = [np.zeros(0, np.int64)]
-    for block, start, end in zip(iter_blocks(*arrays), before[:-1], before[1:], strict=True):
+    every = iter_hits(recording.hit, p_static, dynamic)
+    for hits, start, end in zip(every, before[:-1], before[1:], strict=True):
         low, high = np.searchsorted(chosen, [start, end])
-        candidates = np.flatnonzero(is_chosen(block))
-        parts.append(block.start + candidates[chosen[low:high] - start])
+        parts.append(hits[chosen[low:high] - start])
     return recording.end_points(np.concatenate(parts), poses)

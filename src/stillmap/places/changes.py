@@ -247,16 +247,10 @@ def _split_by_time(events: Events, min_cells: int) -> list[Events]:
 
 def _make_change(events: Events, place: PlaceStates) -> PlaceChange:
     cells = np.unique(events.cell)
-    low, high = _box(place, cells)
-    return PlaceChange(
-        "appeared" if events.came[0] else "gone",
-        low,
-        high,
-        int(events.before.max()),
-        int(events.after.min()),
-        float(place.states.p_changing[cells].mean()),
-        cells,
-    )
+    kind: Kind = "appeared" if events.came[0] else "gone"
+    between = int(events.before.max()), int(events.after.min())
+    probability = float(place.states.p_changing[cells].mean())
+    return PlaceChange(kind, *_box(place, cells), *between, probability, cells)
 
 
 def _box(place: PlaceStates, cells: Index) -> tuple[Float, Float]:
