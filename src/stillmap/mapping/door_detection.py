@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Cells
 from stillmap.core.square_box import cell_keys
 from stillmap.mapping.change_detection import Change, make_change
@@ -166,9 +167,8 @@ def _find_shut(sector: Sector, surface: Cells, resolution: float) -> int:
     counts = []
     for direction in sector.directions:
         along = np.array([math.cos(direction), math.sin(direction)])
-        off = surface - sector.hinge
-        ahead = off @ along
-        aside = np.abs(off @ np.array([-along[1], along[0]]))
+        ahead, left = se2.along_and_across(surface - sector.hinge, along)
+        aside = np.abs(left)
         # beyond the leaf, and behind the hinge
         beyond = (ahead > sector.length) & (ahead <= sector.length + reach) & (aside <= 3.0)
         behind = (ahead < 0.0) & (ahead >= -reach) & (aside <= 3.0)

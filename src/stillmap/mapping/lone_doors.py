@@ -15,15 +15,9 @@ from stillmap import em
 from stillmap.core.array_types import Cells, Float, Float32, Index, Int64
 from stillmap.core.chunks import iter_beams
 from stillmap.core.square_box import cell_keys
-from stillmap.mapping import door_states
+from stillmap.mapping import door_states, doorways
 from stillmap.mapping.doors import Door, DoorState
-from stillmap.mapping.doorways import (
-    LoneLeaf,
-    estimate_p_door,
-    estimate_shut_share,
-    find_doorways,
-    find_shut_leaf,
-)
+from stillmap.mapping.doorways import LoneLeaf
 from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.lone_leaves import find_open_leaf, is_doorway_free, is_thin
 
@@ -112,13 +106,13 @@ def find_lone_doors(surface: Cells, doors: Sequence[Door], known: LabelledRecord
         doors: those that were seen to swing.
         known: 2D.
     """
-    doorways = find_doorways(surface, known.resolution)
-    if not doorways:
+    gaps = doorways.find_doorways(surface, known.resolution)
+    if not gaps:
         return []
     counts = _count_beams(known)
-    free = [doorway for doorway in doorways if is_doorway_free(doorway, counts)]
+    free = [gap for gap in gaps if is_doorway_free(gap, counts)]
     found = [
-        find(doorway, surface) for find in (find_open_leaf, find_shut_leaf) for doorway in free
+        find(gap, surface) for find in (find_open_leaf, doorways.find_shut_leaf) for gap in free
     ]
     taken, leaves = [door.swept_cells for door in doors], list[LoneLeaf]()
     for leaf in found:
@@ -200,8 +194,8 @@ def _rate_lone(
     is_open = np.array([len(door.open_cells) > 0 for door in lone], bool)
     same, moved = compute_p_moved(swung, observations, stamp_ns)
     p_door = np.full(len(lone), _P_LEAF)
-    p_shut = estimate_shut_share(swung) * same[~is_open]
-    p_door[~is_open] = estimate_p_door(p_shut, len(swung) + int(is_open.sum()))
+    p_shut = doorways.estimate_shut_share(swung) * same[~is_open]
+    p_door[~is_open] = doorways.estimate_p_door(p_shut, len(swung) + int(is_open.sum()))
     return [
         dataclasses.replace(lone[k], p_moved=float(moved[k] * p_door[k]))
         for k in np.flatnonzero(p_door >= _MIN_P_LISTED).tolist()

@@ -13,17 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 import stillmap._core as _core
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Cells, Float
 from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
+from stillmap.mapping import resting_leaf
 from stillmap.mapping.doorways import Doorway, LoneLeaf
 from stillmap.mapping.labelled_recording import LabelledRecording
-from stillmap.mapping.resting_leaf import (
-    MIN_COVERED,
-    MIN_EXACT,
-    NEAR_HINGE,
-    SurfaceField,
-    score_leaves,
-)
+from stillmap.mapping.resting_leaf import SurfaceField
 
 _ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
 _SHIFT = np.array([-0.5, 1.0])  # cells of the hinge into the doorway
@@ -68,7 +64,7 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
 
 def _goes_on(leaf: LoneLeaf, surface: Cells) -> bool:
     """True if the surface of a leaf goes on behind the hinge."""
-    along, across = _along_and_across(leaf, surface)
+    along, across = se2.along_and_across(surface - leaf.hinge, leaf.leaf)
     behind = (along < -_BEHIND_WALL) & (along > -_BEHIND_WALL - _GOES_ON)
     row = np.unique(np.round(along[behind & (np.abs(across) <= 1.5)]))
     return len(row) > _MAX_GOES_ON
@@ -76,18 +72,12 @@ def _goes_on(leaf: LoneLeaf, surface: Cells) -> bool:
 
 def _measure_roughness(leaf: LoneLeaf, surface: Cells) -> float:
     """Standard deviation of the surface of a leaf from a line, cells."""
-    along, across = _along_and_across(leaf, surface)
-    of_leaf = (along > NEAR_HINGE * leaf.length) & (along < leaf.length)
+    along, across = se2.along_and_across(surface - leaf.hinge, leaf.leaf)
+    of_leaf = (along > resting_leaf.NEAR_HINGE * leaf.length) & (along < leaf.length)
     of_leaf &= np.abs(across) <= _BAND
     line = np.column_stack([along[of_leaf], np.ones(np.count_nonzero(of_leaf))])
     fitted = line @ np.linalg.lstsq(line, across[of_leaf], rcond=None)[0]
     return float(np.sqrt(np.mean((across[of_leaf] - fitted) ** 2)))
-
-
-def _along_and_across(leaf: LoneLeaf, cells: Cells) -> tuple[Float, Float]:
-    """Coordinates of cells from the hinge of a leaf, along it and across."""
-    off = cells - leaf.hinge
-    return off @ leaf.leaf, off @ np.array([-leaf.leaf[1], leaf.leaf[0]])
 
 
 def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
@@ -102,7 +92,7 @@ def is_thin(leaf: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
     across = np.array([-leaf.leaf[1], leaf.leaf[0]])
     if across @ leaf.shut < 0.0:
         across = -across
-    t = np.arange(NEAR_HINGE * leaf.length + 1.0, leaf.length)
+    t = np.arange(resting_leaf.NEAR_HINGE * leaf.length + 1.0, leaf.length)
     row = leaf.hinge + t[:, None] * leaf.leaf
     inside, behind = (
         max(_passed_share(counts, row + k * side * across) for k in _BESIDE) for side in (1.0, -1.0)
@@ -149,8 +139,8 @@ def _rate_leaves(
         t = _count_up(length + _BEYOND[1])
         points = every.hinge[:, None] + t[:, None] * every.leaf[:, None]
         row, beyond = points[:, t <= length], points[:, t >= length + _BEYOND[0]]
-        is_far = t[t <= length] >= NEAR_HINGE * length
-        score = score_leaves(field, row, beyond, every.leaf, is_far, _MIN_CLEAR)
+        is_far = t[t <= length] >= resting_leaf.NEAR_HINGE * length
+        score = resting_leaf.score_leaves(field, row, beyond, every.leaf, is_far, _MIN_CLEAR)
         k = int(score.argmax())
         if score[k] > (best[0] if best else 0.0):
             cells = field.cells_along(row[k], every.leaf[k, ::-1] * [-1.0, 1.0])
@@ -169,7 +159,10 @@ def _sample_leaves(
     leaf = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
     least = _count_up(doorway.width + _LONGER[0])
     kept = np.arange(len(angle))
-    for layer, share in ((field.is_near, MIN_COVERED), (field.is_surface, MIN_EXACT)):
+    for layer, share in (
+        (field.is_near, resting_leaf.MIN_COVERED),
+        (field.is_surface, resting_leaf.MIN_EXACT),
+    ):
         row = hinge[kept, None] + least[:, None] * leaf[kept, None]
         kept = kept[field.sample(layer, row).mean(axis=1) >= share]
     return _Hypotheses(hinge[kept], leaf[kept], angle[kept])

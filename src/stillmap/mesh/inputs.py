@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, max_scan_duration_ns
@@ -114,9 +115,7 @@ class ObjectFrame(NamedTuple):
     def to_object(self, seconds: Float, points: Float) -> Float:
         """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
         center, heading, bottom = self.box.pose_at(seconds)
-        off = points[:, :2] - center
-        ahead = (off * heading).sum(axis=1)
-        left = off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1]
+        ahead, left = se2.along_and_across(points[:, :2] - center, heading)
         dx, dy, turn = (np.interp(seconds, self.seconds, column) for column in self.offset.T)
         c, s = np.cos(turn), np.sin(turn)
         x, y = c * ahead - s * left + dx, s * ahead + c * left + dy
@@ -148,8 +147,7 @@ class OrientedBox(NamedTuple):
     def local(self, points: Float) -> Float:
         """(n, 3) metres ahead, to the left and above the center, of map points (n, 3)."""
         off = points - self.center
-        ahead = off[:, :2] @ self.heading
-        left = off[:, 1] * self.heading[0] - off[:, 0] * self.heading[1]
+        ahead, left = se2.along_and_across(off[:, :2], self.heading)
         return np.stack([ahead, left, off[:, 2]], axis=1)
 
 

@@ -20,12 +20,8 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import EmOptions, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
-from stillmap.pipeline.tilting_beams import (
-    BoxBeams,
-    PosedRecording,
-    pose_recording,
-    select_box_beams,
-)
+from stillmap.pipeline import tilting_beams
+from stillmap.pipeline.tilting_beams import BoxBeams, PosedRecording
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import Box, fit_boxes
 from stillmap.tracking.objects_3d import MIN_POINTS
@@ -118,7 +114,7 @@ def build_tilting(
         threads: the result does not depend on it.
         use_evidence: whether the tilting laser's own occupancy evidence counts.
     """
-    posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
+    posed = tilting_beams.pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
     # from all level surfaces, as nothing is labelled yet
     ground = estimate_ground(posed.deskewed, posed.poses, _constant_labels(posed.deskewed, 1.0))
     learned: dict[str, Any] = {"p_static": em_options.prior}
@@ -131,7 +127,7 @@ def build_tilting(
         static, learned = evidence.p_static, evidence.learned
     boxes = fit_boxes(planar.deskewed, planar.poses, planar.p_static, planar.objects)
     start_ns = int(planar.deskewed.stamp_ns[0])
-    in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns)
+    in_boxes = tilting_beams.select_box_beams(boxes, recording, posed, ground, start_ns)
     p_static = apply_boxes(static, in_boxes, learned["p_static"], recording.scratch)
     return TiltingResult(
         recording,

@@ -12,7 +12,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em import GroundMap
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
-from stillmap.io.trajectory import embed_in_3d
+from stillmap.io.trajectory import bracket_times, embed_in_3d
 from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED
 from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box
 
@@ -50,11 +50,7 @@ def interpolate_poses(stamp_ns: Int64, poses: Float, at_ns: Int64) -> tuple[Floa
         (N, 3, 3) poses, outside the scans' time the first or the last one; (N,) whether they are
         known.
     """
-    last = max(len(poses) - 2, 0)
-    before = np.clip(np.searchsorted(stamp_ns, at_ns, side="right") - 1, 0, last)
-    after = np.minimum(before + 1, len(poses) - 1)
-    seconds = 1e-9 * (stamp_ns[after] - stamp_ns[before])
-    since = 1e-9 * (at_ns - stamp_ns[before])
+    before, after, seconds, since = bracket_times(stamp_ns, at_ns)
     share = np.clip(since / np.where(seconds > 0.0, seconds, np.inf), 0.0, 1.0)
     twist = se2.log(se2.inverse(poses[before]) @ poses[after])
     known = (at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping.change_detection import Events, group_events
@@ -36,7 +37,7 @@ def fit_leaf(points: Float) -> Leaf | None:
     """The straight leaf through points (n, 2) in metres; None: they are none."""
     offset = points - points.mean(axis=0)
     axis = np.linalg.eigh(offset.T @ offset)[1][:, 1]
-    along, across = offset @ axis, offset @ [-axis[1], axis[0]]
+    along, across = se2.along_and_across(offset, axis)
     length = float(np.ptp(along))
     if not _LENGTH[0] <= length <= _LENGTH[1] or float(np.abs(across).max()) > _THICKNESS:
         return None
@@ -80,8 +81,7 @@ def is_hinged(leaf: Leaf, wall: Float) -> bool:
 def _is_gap(end: Float, angle: float, length: float, wall: Float) -> bool:
     """True if a wall ends near a point and goes on in a direction, a leaf's width away."""
     u = np.array([np.cos(angle), np.sin(angle)])
-    offset = wall - end
-    along, across = offset @ u, offset @ [-u[1], u[0]]
+    along, across = se2.along_and_across(wall - end, u)
     along = along[np.abs(across) <= _THICKNESS]
     behind, ahead = along[along < length / 2.0], along[along >= length / 2.0]
     if not len(behind) or not len(ahead):

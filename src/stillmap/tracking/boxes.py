@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.tracking import MovingObject
@@ -56,10 +57,9 @@ class Box:
         """(n,) whether positions (n, 2) at times (n,) lie within `margin` metres of the box."""
         early, late = self._outside(seconds)
         at = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)
-        heading, offset = self.heading[at], xy - self.center_at(seconds)
-        along = np.abs((offset * heading).sum(axis=1))
-        across = np.abs(offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1])
-        near = (along <= self.half_size[0] + margin) & (across <= self.half_size[1] + margin)
+        along, across = se2.along_and_across(xy - self.center_at(seconds), self.heading[at])
+        near = np.abs(along) <= self.half_size[0] + margin
+        near &= np.abs(across) <= self.half_size[1] + margin
         return np.asarray(near & (late - early <= self.hold))
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core import arrays
+from stillmap.core import arrays, se2
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.detections import count_tracks
@@ -215,10 +215,9 @@ def _extend(clusters: _Clusters, seeds: _Seeds) -> _Seeds:
     dt = clusters.seconds[later] - t[which, -1]
     xy = clusters.edge[later, seeds.side[which]]
     off = xy - seeds.xy[which, -1] - dt[:, None] * velocity[which]
-    along = (off * u[which]).sum(axis=1) / _GATE_ALONG
+    along, across = se2.along_and_across(off, u[which])
     gate = _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
-    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / gate
-    cost = along**2 + across**2
+    cost = (along / _GATE_ALONG) ** 2 + (across / gate) ** 2
     near = np.flatnonzero(cost < 1.0)
     order = near[np.lexsort((cost[near], which[near]))]
     best = order[np.flatnonzero(np.diff(which[order], prepend=-1))]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stillmap.core import arrays
+from stillmap.core import arrays, se2
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.config import CheckedOptions, option
@@ -195,8 +195,7 @@ def estimate_center_offset(centroid: Float, sensor: Float, xy: Float, at: Index)
     """
     away = centroid - sensor
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    offset = xy - centroid[at]
-    across = offset[:, 1] * away[at, 0] - offset[:, 0] * away[at, 1]
+    _, across = se2.along_and_across(xy - centroid[at], away[at])
     low, high = np.full(len(centroid), np.inf), np.full(len(centroid), -np.inf)
     np.minimum.at(low, at, across)
     np.maximum.at(high, at, across)
@@ -214,8 +213,7 @@ def measure_box(offset: Float, velocity: Float) -> tuple[float, float]:
     speed = np.linalg.norm(velocity, axis=1)
     if np.median(speed) > HEADING_SPEED:
         heading = velocity / np.maximum(speed, 1e-9)[:, None]
-        along = (offset * heading).sum(axis=1)
-        across = offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1]
+        along, across = se2.along_and_across(offset, heading)
     else:
         axes = np.linalg.eigh(offset.T @ offset)[1]
         across, along = (offset @ axes).T
