@@ -25,9 +25,9 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
+from stillmap import mapping
 from stillmap.core.square_box import cell_keys
 from stillmap.mapping.doors import Door
-from stillmap.pipeline import final_map
 from stillmap.results.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.results.eval.trajectory import align
 from stillmap.results.reader import moved
@@ -79,8 +79,8 @@ def _scored(run: Run) -> Scores:
 
     begun = time.process_time()
     with (
-        mock.patch.object(final_map, "find_doors", timed(final_map.find_doors)),
-        mock.patch.object(final_map, "find_lone_doors", timed(final_map.find_lone_doors)),
+        mock.patch.object(mapping, "find_doors", timed(mapping.find_doors)),
+        mock.patch.object(mapping, "find_lone_doors", timed(mapping.find_lone_doors)),
     ):
         result = stillmap.build(
             simulation.recording, options_of("stillmap", run.settings), poses=poses

@@ -11,6 +11,7 @@ from stillmap import em
 from stillmap.core import chunks
 from stillmap.em.change_hmm import _group_cells
 from stillmap.mapping import detect_changes, relabel_changes
+from stillmap.mapping.labelled_recording import LabelledRecording
 
 CAME, LEFT, STANDS, STOOD, PASSED = 3, 4, 5, 6, 7
 SECONDS = 200
@@ -117,9 +118,8 @@ def final_e_step(seen, state="last", threads=1, **options):
     # each cell decides alone
     alone = "stillmap.mapping.changed_objects.pool_states"
     with mock.patch(alone, lambda histories, *_: histories.share_there(state)):
-        shown = relabel_changes(
-            seen.recording, seen.poses, all_static, before, found, places, state, threads
-        )
+        known = LabelledRecording(seen.recording, seen.poses, all_static, RESOLUTION, threads)
+        shown = relabel_changes(known, before, found, places, state)
     return shown, found
 
 

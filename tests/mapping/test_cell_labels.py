@@ -9,6 +9,7 @@ from synthetic_histories import course
 
 from stillmap.em import CellProbabilities
 from stillmap.mapping import update_occupancy
+from stillmap.mapping.labelled_recording import LabelledRecording
 
 
 class _SurfelOfBeams:
@@ -33,8 +34,9 @@ def updated(before, after, share):
     histories = dataclasses.replace(histories, surfel_map=_SurfelOfBeams())
     occupied = CellProbabilities(cells, np.full(2, 0.05, np.float32), 0.2)
     poses = np.tile(np.eye(3), (n, 1, 1))
-    labels = (np.tile(np.array(row, np.float32), n) for row in (before, after))
-    return update_occupancy(recording, poses, *labels, histories, occupied).p_occupied
+    old, new = (np.tile(np.array(row, np.float32), n) for row in (before, after))
+    known = LabelledRecording(recording, poses, old, 0.1)
+    return update_occupancy(known, new, histories, occupied).p_occupied
 
 
 def test_cells_of_movers_stay_and_clutter_becomes_an_obstacle_if_it_was_there_for_long():

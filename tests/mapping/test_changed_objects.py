@@ -8,6 +8,7 @@ from synthetic_histories import RESOLUTION, block, course, found, recording
 
 from stillmap.core import se2
 from stillmap.mapping import find_changed_object_beams
+from stillmap.mapping.labelled_recording import LabelledRecording
 
 BOX = block(10, 20, 4, 3)
 
@@ -24,7 +25,8 @@ def left_out(*parts, at=INSIDE, p=0.1, hit=True, least=1, poses=None):
     before = np.full(100, p, np.float32)
     places = found(*parts, seen=seen, least=least)
     assert len(places) > 0
-    beams = find_changed_object_beams(seen, poses, before, places, [], RESOLUTION)
+    known = LabelledRecording(seen, poses, before, RESOLUTION)
+    beams = find_changed_object_beams(known, places, [])
     return np.sort(beams).tolist()
 
 

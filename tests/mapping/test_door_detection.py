@@ -7,6 +7,7 @@ import pytest
 from synthetic_histories import RESOLUTION, recording
 
 from stillmap.mapping import Change, find_doors, join_doors
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.resting_leaf import find_resting_leaf
 
 S = 10**9
@@ -50,7 +51,8 @@ CRATE = change("came", np.array([[60, 60], [61, 60], [60, 61], [61, 61]]), 20, 2
 
 
 def joined(changes, surface, seen, poses):
-    return join_doors(changes, find_doors(changes, [], surface, seen, poses, RESOLUTION))
+    known = LabelledRecording(seen, poses, np.ones(seen.n_beams, np.float32), RESOLUTION)
+    return join_doors(changes, find_doors(changes, [], surface, known))
 
 
 def test_departure_and_arrival_of_a_leaf_are_one_door():

@@ -12,6 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.em.observations import build_surfel_map
 from stillmap.mapping import Change, relabel_changes
 from stillmap.mapping.changed_objects import pool_states
+from stillmap.mapping.labelled_recording import LabelledRecording
 
 SCANS, BEAMS = 60, 20
 # around the origin, and with cells in which no beam ended
@@ -41,15 +42,8 @@ class Known:
 
     def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
         said = {"occupied": self.occupied, "histories": self.histories} | other
-        return relabel_changes(
-            self.seen,
-            self.poses,
-            self.p_static,
-            **said,
-            changes=changes,
-            state=state,
-            threads=threads,
-        )
+        known = LabelledRecording(self.seen, self.poses, self.p_static, RESOLUTION, threads)
+        return relabel_changes(known, **said, changes=changes, state=state)
 
 
 @pytest.fixture(scope="module")

@@ -43,9 +43,9 @@ def standing():
     return np.tile(np.eye(3), (len(STAMPS), 1, 1))
 
 
-def box_of(one, hold=0.5):
+def box_of(one):
     empty = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
-    return fit_boxes(empty, standing(), np.zeros(0, np.float32), [one], 0.7, hold)[0]
+    return fit_boxes(empty, standing(), np.zeros(0, np.float32), [one])[0]
 
 
 def test_box_moves_and_turns_with_its_object():
@@ -57,9 +57,9 @@ def test_box_moves_and_turns_with_its_object():
     assert box.contains(seconds, np.array(xy), 0.02).tolist()[:5] == [True] * 5
 
 
-def test_box_persists_for_hold_seconds():
-    box = box_of(walker([0.5, 1.0, 1.5]), hold=0.3)
-    seconds = np.array([0.25, 1.75, 0.15, 1.85])
+def test_box_persists_for_half_a_second():
+    box = box_of(walker([0.5, 1.0, 1.5]))
+    seconds = np.array([0.05, 1.95, -0.05, 2.05])
     xy = np.stack([np.full(4, 2.0), seconds - 1.0], axis=1)
     assert box.contains(seconds, xy, 0.0).tolist() == [True, True, False, False]
 
@@ -70,12 +70,12 @@ def test_untracked_clusters_have_a_short_box():
     offset = np.where(np.arange(len(STAMPS) + 1) > 4, 3, 0)
     p_static = np.full(3, 0.1, np.float32)
     recording = flat_recording(points, offset)
-    boxes = fit_boxes(recording, standing(), p_static, [], 0.7, 0.5)
+    boxes = fit_boxes(recording, standing(), p_static, [])
     assert [box.object_id for box in boxes] == [-1]
     held = boxes[0].contains(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1)
     assert held.tolist() == [True, False]
     p_static[:] = 0.31  # P(dynamic) below 0.7
-    assert not fit_boxes(recording, standing(), p_static, [], 0.7, 0.5)
+    assert not fit_boxes(recording, standing(), p_static, [])
 
 
 @pytest.mark.parametrize(

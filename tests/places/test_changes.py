@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stillmap.mapping.change_detection import Events
 from stillmap.places import changes
 from stillmap.places.changes import Leaf, fit_leaf, is_hinged, turn_about_hinge
 from stillmap.places.evidence import BLOCK, BeamCells, Evidence, crop_without_gaps
@@ -25,8 +26,8 @@ def test_events_beside_a_change_share_a_part_of_its_time():
     """One that ended before another began cannot both belong to one thing."""
     place = make_states([(0, 0), (1, 0), (0, 1), (1, 1), (-1, 0)])
     came = np.ones(1, bool)
-    group = changes._Events(np.array([0]), came, np.array([0]), np.array([5]))
-    beside = changes._Events(
+    group = Events(np.array([0]), came, np.array([0]), np.array([5]))
+    beside = Events(
         np.array([1, 2, 3, 4]), np.ones(4, bool), np.array([0, 3, 3, 4]), np.array([2, 5, 4, 5])
     )
     found = changes._attach(group, beside, place)

@@ -4,7 +4,7 @@ import pytest
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import matrix
-from stillmap.mapping.beam_statistics import count_beams, sample_points
+from stillmap.mapping.labelled_recording import count_beams, sample_points
 
 
 @pytest.fixture(params=[7, 1000, 1 << 20])

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 from recordings import of_one_sensor
 
-from stillmap.tracking.explained_hits import compute_log_ratio, explain_hits, find_mover_hits
+from stillmap.mapping.labelled_recording import LabelledRecording
+from stillmap.tracking.explained_hits import PLACE, compute_log_ratio, explain_hits, find_mover_hits
 from stillmap.tracking.mover_path import MoverPath
 
 SECONDS = np.arange(0.0, 4.0, 0.1)
@@ -33,7 +34,7 @@ def explained(p_mover, paths, is_vehicle=True):
     poses = np.tile(np.eye(3), (len(SECONDS), 1, 1))
     on_movers = find_mover_hits(recording, poses, SECONDS, paths, np.array(p_mover))
     vehicles = np.full(len(paths), is_vehicle)
-    after = explain_hits(recording, poses, before, on_movers, vehicles)
+    after = explain_hits(LabelledRecording(recording, poses, before, PLACE), on_movers, vehicles)
     assert (before == np.float32(0.9)).all()
     return after.reshape(-1, 2).T
 

@@ -18,7 +18,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.builder import ReadContext
 from stillmap.io.registry import detect_format
-from stillmap.mapping.beam_statistics import count_beams
+from stillmap.mapping.labelled_recording import count_beams
 from stillmap.pipeline import inputs
 from stillmap.pipeline.checkpoint import CheckpointFolder, identify_run
 from stillmap.pipeline.em_loop import EmState

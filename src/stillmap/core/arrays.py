@@ -210,6 +210,14 @@ def sample_indices(count: int, max_count: int) -> NDArray[np.int64]:
     return np.minimum((at * (count / max_count)).astype(np.int64), count - 1)
 
 
+def expand_ranges(
+    first: NDArray[np.intp], count: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Numbers first, first + 1, ... of n ranges with counts (n,): which range each is of; them."""
+    of = np.repeat(np.arange(len(count)), count)
+    return of, np.arange(len(of)) + np.repeat(first - np.cumsum(count) + count, count)
+
+
 def unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """`np.unique` of the rows of cells (n, D) and their inverse (n,); faster, as it sorts numbers.
 

@@ -1,7 +1,9 @@
 """SE(2): poses in the plane as homogeneous matrices, vectorized over leading axes."""
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core.array_types import Float
 
@@ -100,6 +102,12 @@ def rotate_covariance(covariance: Float, T: Float) -> Float:
     R[..., :D, :D] = T[..., :D, :D]
     R[..., D:, D:] = T[..., :D, :D] if D == 3 else 1.0
     return R @ covariance @ np.swapaxes(R, -1, -2)
+
+
+def along_and_across(offset: NDArray[Any], direction: Float) -> tuple[Float, Float]:
+    """(...) components of offsets (..., 2) along unit directions (..., 2) and to their left."""
+    along = (offset * direction).sum(axis=-1)
+    return along, offset[..., 1] * direction[..., 0] - offset[..., 0] * direction[..., 1]
 
 
 def project_to_plane(poses: Float) -> Float:

@@ -5,6 +5,7 @@ memory and disk. So a box that is much larger than what was seen shrinks: to the
 was seen, whole if it is connected, and to what lies near it.
 """
 
+import functools
 import itertools
 import math
 from typing import Any, NamedTuple
@@ -172,6 +173,11 @@ def find_busiest(places: Squares, edge: int) -> Squares:
     return middle
 
 
-def cell_keys(cells: Squares) -> Squares:
-    """(...) a number for each cell (..., 2), in their order; there are far less than 2 ** 31."""
-    return np.asarray((cells[..., 0] << 32) + cells[..., 1], np.int64)
+def cell_keys(cells: NDArray[np.integer]) -> Squares:
+    """(...) a number for each cell (..., D), in their order: column by column.
+
+    Columns of other than the first lie within 2 ** 31, in 3D all within 2 ** 20 of zero.
+    """
+    columns = np.moveaxis(cells, -1, 0).astype(np.int64, copy=False)
+    bits = 64 // len(columns)
+    return functools.reduce(lambda key, column: (key << bits) + column, columns)

@@ -101,6 +101,22 @@ def embed_in_3d(T: Float) -> Float:
     return out
 
 
+def bracket_times(stamp_ns: Int64, at_ns: Int64) -> tuple[Index, Index, Float, Float]:
+    """(n,) scans before and after given times (n,), the seconds between, and those since the first.
+
+    Args:
+        stamp_ns: (T,) of the scans, non-decreasing, T > 0; before and after them the outermost two
+            count.
+        at_ns: (n,).
+    """
+    last = len(stamp_ns) - 1
+    before = np.searchsorted(stamp_ns, at_ns, side="right") - 1
+    before = np.clip(before, 0, max(last - 1, 0))
+    after: Index = np.minimum(before + 1, last)
+    since, between = at_ns - stamp_ns[before], stamp_ns[after] - stamp_ns[before]
+    return before, after, np.asarray(1e-9 * between), np.asarray(1e-9 * since)
+
+
 def write_tum(path: Path, stamp_ns: Int64, poses: Float) -> None:
     """Write one line per pose.
 

@@ -181,7 +181,7 @@ def group_changes(
         kept = is_explained(xy, events.before, events.after, movers)
         events = events.select(np.flatnonzero(kept))
     out = []
-    for group in _group_events(events, changed.cells, radius):
+    for group in group_events(events, changed.cells, radius, round(_MAX_TIME_GAP * 1e9)):
         out += _split_by_time(group, changed.cells, resolution)
     out += _recurring_changes(changed, np.flatnonzero(recurring), stamps, resolution)
     out = _remove_noise(_absorb_small_parts(out, resolution, radius), unchanged)
@@ -202,19 +202,23 @@ class _BinStamps:
         return self._stamp_ns[np.searchsorted(self._number, bins, side="right") - 1]
 
 
-class _Events(NamedTuple):
-    """N changes of single cells: which cell, came or left, and between which stamps in ns."""
+class Events(NamedTuple):
+    """N changes of single cells: the cell, came or left, the last time before and the first after.
+
+    Times are stamps in ns, or numbers of sessions.
+    """
 
     cell: Index
     came: Bool
     before: Int64
     after: Int64
 
-    def select(self, chosen: Index) -> "_Events":
-        return _Events._make(column[chosen] for column in self)
+    def select(self, chosen: Index) -> "Events":
+        """Some of the changes (n,)."""
+        return Events._make(column[chosen] for column in self)
 
 
-def _make_events(changed: ChangedCells, cells: Index, stamps: _BinStamps) -> _Events:
+def _make_events(changed: ChangedCells, cells: Index, stamps: _BinStamps) -> Events:
     """The one or two changes of each of these cells."""
     twice = np.flatnonzero(changed.n_changes[cells] == 2)
     cell = np.concatenate([cells, cells[twice]])
@@ -222,7 +226,7 @@ def _make_events(changed: ChangedCells, cells: Index, stamps: _BinStamps) -> _Ev
     # the last change led to the final state, the first of two changes away from it
     came = (changed.p_object[cell] > 0.5) == (which == 1)
     bins = changed.change_bins[cell, which]
-    return _Events(cell, came, stamps.last(bins[:, 0]), stamps.first(bins[:, 1]))
+    return Events(cell, came, stamps.last(bins[:, 0]), stamps.first(bins[:, 1]))
 
 
 def _explained_recurring(
@@ -238,9 +242,11 @@ def _explained_recurring(
     return np.asarray(first | last)
 
 
-def _group_events(events: _Events, cells: Cells, radius: float) -> list[_Events]:
-    """Connected events of one kind, within `radius` cells and with overlapping time spans."""
-    slack = round(_MAX_TIME_GAP * 1e9)
+def group_events(events: Events, cells: Cells, radius: float, slack: int = 0) -> list[Events]:
+    """Connected events of one kind, within `radius` of cells (K, D), whose time spans overlap.
+
+    slack: by which these may fail to.
+    """
     pairs = neighbor_pairs(cells[events.cell], radius)
     i, j = pairs.T
     begin = np.maximum(events.before[i], events.before[j])
@@ -251,7 +257,7 @@ def _group_events(events: _Events, cells: Cells, radius: float) -> list[_Events]
     ]
 
 
-def _split_by_time(events: _Events, cells: Cells, resolution: float) -> list[Change]:
+def _split_by_time(events: Events, cells: Cells, resolution: float) -> list[Change]:
     """Changes of a group, one after the other: each at the time that fits most cells left."""
     out = []
     slack = round(_MAX_TIME_GAP * 1e9)
@@ -266,7 +272,7 @@ def _split_by_time(events: _Events, cells: Cells, resolution: float) -> list[Cha
         if np.count_nonzero(mine) >= _MIN_CELLS:
             kind: Kind = "came" if events.came[0] else "left"
             its = cells[np.unique(events.cell[mine])]
-            out.append(_make_change(kind, its, resolution, before, stamp, stamp, 1))
+            out.append(make_change(kind, its, resolution, before, stamp, stamp, 1))
         events = events.select(np.flatnonzero(~mine))
     return out
 
@@ -287,7 +293,7 @@ def _recurring_changes(
         last = int(stamps.first(bins[:, 1, 1]).max())
         times = int(np.median(changed.n_changes[chosen]))
         cells = changed.cells[chosen]
-        out.append(_make_change("comes and goes", cells, resolution, before, stamp, last, times))
+        out.append(make_change("comes and goes", cells, resolution, before, stamp, last, times))
     return out
 
 
@@ -303,7 +309,7 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
             if small and _within(larger.cells, change.cells, radius):
                 cells = np.unique(np.concatenate([larger.cells, change.cells]), axis=0)
                 times = (larger.before_ns, larger.stamp_ns, larger.last_ns, larger.times)
-                out[k] = _make_change(change.kind, cells, resolution, *times)
+                out[k] = make_change(change.kind, cells, resolution, *times)
                 break
         else:
             out.append(change)
@@ -336,9 +342,10 @@ def _remove_noise(changes: list[Change], unchanged: Cells) -> list[Change]:
     return out
 
 
-def _make_change(
+def make_change(
     kind: Kind, cells: Cells, resolution: float, before: int, stamp: int, last: int, times: int
 ) -> Change:
+    """The change of cells (K, D) in the box around them; stamps in ns."""
     low, high = cells.min(axis=0) * resolution, (cells.max(axis=0) + 1) * resolution
     x, y, *z = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
     size = tuple((high - low).tolist())

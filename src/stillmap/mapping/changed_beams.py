@@ -7,28 +7,23 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap import em
-from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
-from stillmap.core.chunks import iter_beams
-from stillmap.core.recording import Recording
+from stillmap.core.array_types import Bool, Float32, Index, Int64
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import find_shown_cells, is_same_place
 from stillmap.mapping.doors import Door, fit_sector
+from stillmap.mapping.labelled_recording import LabelledRecording
 
 _EVER = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # stamps
 
 
 def relabel_changes(
-    recording: Recording,
-    poses: Float,
-    p_static: Float32,
+    known: LabelledRecording,
     occupied: em.CellProbabilities,
     histories: em.CellHistories,
     changes: list[Change],
     state: em.MapState,
-    threads: int = 1,
 ) -> tuple[Float32, em.CellProbabilities]:
     """Labels (M,) and map cells, taken from the cell histories within the listed changes.
 
@@ -37,23 +32,20 @@ def relabel_changes(
     Changes of cells that are not listed are noise.
 
     Args:
-        recording: M beams.
-        poses: (T, 3, 3) T_map_base.
-        p_static, occupied, histories: from the final E-step at these poses.
+        known: M beams, with the labels of the final E-step.
+        occupied, histories: from the same.
         changes: from `detect_changes`.
         state: state of changed places that the map shows.
-        threads: number of threads; the result does not depend on it.
     """
     if not changes:
-        return p_static, occupied
+        return known.p_static, occupied
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
     listed, p_in_map, p_leaf = find_shown_cells(histories, changes, state)
     # a leaf that swings is no static object, wherever the map shows it
     label = p_in_map * (1.0 - p_leaf)
-    out = arrays.copy(p_static, recording.scratch)
-    for _, beams, data in iter_beams(recording, poses, release=[out]):
-        surfel = histories.surfel_map.associate_beams(*data, threads)
+    out = known.copy_labels()
+    for beams, surfel in known.iter_surfels(histories, out):
         ended = np.flatnonzero(surfel >= 0)
         ended = ended[listed[surfel[ended]]]
         out[beams][ended] = label[surfel[ended]]
@@ -62,12 +54,7 @@ def relabel_changes(
 
 
 def find_changed_object_beams(
-    recording: Recording,
-    poses: Float,
-    p_static: Float32,
-    changes: list[Change],
-    doors: list[Door],
-    resolution: float,
+    known: LabelledRecording, changes: list[Change], doors: list[Door]
 ) -> Index:
     """(n,) dynamic beams, rising, that ended on an object while it stood in a changed place.
 
@@ -83,11 +70,10 @@ def find_changed_object_beams(
     for door in doors:  # whose leaf is elsewhere is among the changes
         if not (len(door.shut_cells) and len(door.open_cells)):
             stays.append(_Stay.around_cells(door.swept_cells, _EVER))
+    recording = known.recording
     on_objects = ArrayBuilder(np.intp, (), recording.scratch)
-    for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():
-        beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
-        ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
-        cells, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
+    for beam in known.iter_hits(dynamic=True) if stays else ():
+        cells, stamp = known.end_cells(beam), recording.stamp_ns[recording.scans_of(beam)]
         on_object = np.zeros(len(beam), bool)
         for stay in stays:
             inside = np.flatnonzero(stay.bounds(cells, stamp))
@@ -138,13 +124,10 @@ _STRAY_SHARE = 0.15  # of the time, of readings where nothing stands
 
 
 def update_occupancy(
-    recording: Recording,
-    poses: Float,
-    before: Float32,
+    known: LabelledRecording,
     after: Float32,
     histories: em.CellHistories,
     occupied: em.CellProbabilities,
-    threads: int = 1,
 ) -> em.CellProbabilities:
     """Occupancy of cells in which P(dynamic) or P(static) of the beams became less.
 
@@ -153,19 +136,16 @@ def update_occupancy(
     it was there for much of the time: a stray reading of the floor is none. So does P(static).
 
     Args:
-        recording: M beams.
-        poses: (T, 3, 3) T_map_base.
-        before, after: (M,) P(c = 1) of each beam.
+        known: M beams, with the labels before.
+        after: (M,) P(c = 1) of each beam.
         histories: with the surfels of the same cells.
         occupied: with the labels before.
-        threads: number of threads; the result does not depend on it.
     """
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
     sums, static = np.zeros((2, 2, len(occupied.cells)))
-    for _, beams, data in iter_beams(recording, poses, release=[before, after]):
-        surfel = histories.surfel_map.associate_beams(*data, threads)
-        old, new = before[beams], after[beams]
+    for beams, surfel in known.iter_surfels(histories, known.p_static, after):
+        old, new = known.p_static[beams], after[beams]
         ended = np.flatnonzero((surfel >= 0) & (old < DYNAMIC_BELOW))
         for row, p_static in zip(sums, (old, new), strict=True):
             row += np.bincount(surfel[ended], 1.0 - p_static[ended], minlength=len(row))

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core.array_types import Cells, Float
-from stillmap.core.recording import Recording
+from stillmap.core import se2
+from stillmap.core.array_types import Cells
 from stillmap.core.square_box import cell_keys
-from stillmap.mapping.change_detection import Change
+from stillmap.mapping.change_detection import Change, make_change
 from stillmap.mapping.door_states import is_passage_observed, observe_states
 from stillmap.mapping.doors import Door, Sector, fit_sector
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.resting_leaf import find_resting_leaf
 
 _MAX_TIME_GAP = 2.0  # s between the departure from one position and the arrival in the other
@@ -24,12 +25,7 @@ _BEYOND = 0.4  # m beyond the leaf, in which the wall goes on that it closes
 
 
 def find_doors(
-    changes: list[Change],
-    lines: list[Cells],
-    surface: Cells,
-    recording: Recording,
-    poses: Float,
-    resolution: float,
+    changes: list[Change], lines: list[Cells], surface: Cells, known: LabelledRecording
 ) -> list[Change]:
     """One change of kind `door` for all changes of each door, in the order of time.
 
@@ -41,21 +37,19 @@ def find_doors(
         changes: from `detect_changes`; a leaf that swings needs nobody near it.
         lines: (K, 2) cells of each row of dynamic hits that may be a leaf (`find_leaf_lines`).
         surface: (U, 2) cells that are occupied most of the time.
-        recording: with the beams that show the states.
-        poses: (T, 3, 3) T_map_base.
-        resolution: m, edge of a cell.
+        known: 2D, with the beams that show the states.
     """
-    changes = [*changes, *(_as_change(line, recording, resolution) for line in lines)]
+    changes = [*changes, *(_as_change(line, known) for line in lines)]
     left = list(changes)
     out: list[Change] = []
     candidates = _find_candidates(changes, surface)
     doors = [_make_door(candidate, surface) for candidate in candidates]
-    observed = observe_states(doors, recording, poses, resolution)
+    observed = observe_states(doors, known)
     for candidate, shape, states in zip(candidates, doors, observed, strict=True):
         if not all(_holds(left, change) for change in candidate.changes):
             continue  # of a door that was found before
         door = dataclasses.replace(shape, states=states)
-        if not states or not is_passage_observed(door, recording, poses):
+        if not states or not is_passage_observed(door, known):
             continue  # nobody saw it in both positions
         mine = [
             change
@@ -67,12 +61,10 @@ def find_doors(
     return sorted(out, key=lambda change: (change.stamp_ns, change.x, change.y))
 
 
-def _as_change(line: Cells, recording: Recording, resolution: float) -> Change:
+def _as_change(line: Cells, known: LabelledRecording) -> Change:
     """A row of cells as a change at any time: its states tell when."""
-    x, y = ((line.mean(axis=0) + 0.5) * resolution).tolist()
-    first, last = recording.stamp_ns[[0, -1]].tolist()
-    size = tuple((np.ptp(line, axis=0) * resolution + resolution).tolist())
-    return Change("comes and goes", x, y, size, line, resolution, first, last, last, 1)
+    first, last = known.recording.stamp_ns[[0, -1]].tolist()
+    return make_change("comes and goes", line, known.resolution, first, last, last, 1)
 
 
 def join_doors(changes: list[Change], doors: list[Change]) -> list[Change]:
@@ -163,22 +155,10 @@ def _make_door(candidate: _Candidate, surface: Cells) -> Door:
 def _join_changes(changes: list[Change], door: Door) -> Change:
     """All changes of a door in one."""
     cells = np.unique(np.concatenate([change.cells for change in changes]), axis=0)
-    resolution = changes[0].resolution
-    x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
-    swings = list(itertools.pairwise(door.states))
-    return Change(
-        kind="door",
-        x=x,
-        y=y,
-        size=tuple((np.ptp(cells, axis=0) * resolution + resolution).tolist()),
-        cells=cells,
-        resolution=resolution,
-        before_ns=swings[0][0].until_ns,
-        stamp_ns=swings[0][1].since_ns,
-        last_ns=swings[-1][1].since_ns,
-        times=len(swings),
-        door=door,
-    )
+    before, *since = door.states
+    stamps = before.until_ns, since[0].since_ns, since[-1].since_ns
+    change = make_change("door", cells, changes[0].resolution, *stamps, len(since))
+    return dataclasses.replace(change, door=door)
 
 
 def _find_shut(sector: Sector, surface: Cells, resolution: float) -> int:
@@ -187,9 +167,8 @@ def _find_shut(sector: Sector, surface: Cells, resolution: float) -> int:
     counts = []
     for direction in sector.directions:
         along = np.array([math.cos(direction), math.sin(direction)])
-        off = surface - sector.hinge
-        ahead = off @ along
-        aside = np.abs(off @ np.array([-along[1], along[0]]))
+        ahead, left = se2.along_and_across(surface - sector.hinge, along)
+        aside = np.abs(left)
         # beyond the leaf, and behind the hinge
         beyond = (ahead > sector.length) & (ahead <= sector.length + reach) & (aside <= 3.0)
         behind = (ahead < 0.0) & (ahead >= -reach) & (aside <= 3.0)

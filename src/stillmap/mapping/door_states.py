@@ -6,10 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from stillmap.core.array_types import Cells, Float, Index, Int64
-from stillmap.core.arrays import iter_blocks
+from stillmap.core.arrays import expand_ranges
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import cell_keys, group_indices
 from stillmap.mapping.doors import Door, DoorState, Position
+from stillmap.mapping.labelled_recording import LabelledRecording
 
 _BIN_NS = 10**9  # in which the cells that were hit make one observation
 # share of the cells of a leaf that are hit in an observation: who walks through hits fewer
@@ -25,37 +26,27 @@ _AROUND_NS = 5 * 10**8  # before and after an observation, in which the leaf is 
 _RATIO = 2.0  # of that share to the one of the other position
 
 
-def observe_states(
-    doors: Sequence[Door], recording: Recording, poses: Float, resolution: float
-) -> list[tuple[DoorState, ...]]:
+def observe_states(doors: Sequence[Door], known: LabelledRecording) -> list[tuple[DoorState, ...]]:
     """The states of each door: its leaf is where beams end on much of one of its positions.
 
     None where one of the positions was hardly seen.
 
     Args:
         doors: with the cells of both positions.
-        recording: T scans.
-        poses: (T, 3, 3) T_map_base.
-        resolution: m, edge of a cell.
+        known: 2D, T scans.
     """
     leaves = [np.concatenate([door.shut_cells, door.open_cells]) for door in doors]
-    hits = _find_hits_on(leaves, recording, poses, resolution)
-    return [
-        _list_states(door, rows, recording.stamp_ns) for door, rows in zip(doors, hits, strict=True)
-    ]
+    hits, stamp_ns = _find_hits_on(leaves, known), known.recording.stamp_ns
+    return [_list_states(door, rows, stamp_ns) for door, rows in zip(doors, hits, strict=True)]
 
 
-def _find_hits_on(
-    leaves: Sequence[Cells], recording: Recording, poses: Float, resolution: float
-) -> list[Int64]:
+def _find_hits_on(leaves: Sequence[Cells], known: LabelledRecording) -> list[Int64]:
     """(n, 2) scan of each beam that ended on a leaf, and number of the leaf's cell."""
     keys = [cell_keys(leaf) for leaf in leaves]
     orders = [np.argsort(own) for own in keys]
     hits: list[list[Int64]] = [[np.empty((0, 2), np.int64)] for _ in leaves]
-    for block in iter_blocks(recording.hit) if leaves else ():
-        beam = block.start + np.flatnonzero(recording.hit[block])
-        scan = recording.scans_of(beam)
-        key = cell_keys(np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64))
+    for beam in known.iter_hits() if leaves else ():
+        scan, key = known.recording.scans_of(beam), cell_keys(known.end_cells(beam))
         for own, order, rows in zip(keys, orders, hits, strict=True):
             at = np.searchsorted(own, key, sorter=order)
             number = order[np.minimum(at, len(own) - 1)]
@@ -64,18 +55,16 @@ def _find_hits_on(
     return [np.concatenate(rows) for rows in hits]
 
 
-def observe_leaves(
-    leaves: Sequence[Cells], recording: Recording, poses: Float, resolution: float
-) -> list[Int64]:
+def observe_leaves(leaves: Sequence[Cells], known: LabelledRecording) -> list[Int64]:
     """(L, 2) stamps of the first and the last scan of each second that saw a leaf.
 
     Args:
         leaves: (K, 2) cells of each.
-        recording, poses, resolution: see `observe_states`.
+        known: see `observe_states`.
     """
-    hits = _find_hits_on(leaves, recording, poses, resolution)
+    hits = _find_hits_on(leaves, known)
     return [
-        _list_observations(rows, recording.stamp_ns, _MIN_SHARE * len(leaf))
+        _list_observations(rows, known.recording.stamp_ns, _MIN_SHARE * len(leaf))
         for leaf, rows in zip(leaves, hits, strict=True)
     ]
 
@@ -94,7 +83,7 @@ def _list_observations(hits: Int64, stamp_ns: Int64, least: float) -> Int64:
 
 def _list_states(door: Door, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
-    out: list[DoorState] = []
+    seen: list[DoorState] = []
     counts, contradicted = {"shut": 0, "open": 0}, 0
     bins = (stamp_ns[hits[:, 0]] - stamp_ns[0]) // _BIN_NS
     for second in group_indices(bins):
@@ -109,30 +98,28 @@ def _list_states(door: Door, hits: Int64, stamp_ns: Int64) -> tuple[DoorState, .
             continue
         counts[position] += 1
         first, last = int(stamp_ns[scans.min()]), int(stamp_ns[scans.max()])
-        if out and out[-1].position == position:
-            first = out.pop().since_ns
-        out.append(DoorState(position, first, last))
+        seen.append(DoorState(position, first, last))
     # a single one may be of somebody who walks by; a leaf is not in two positions
     swings = min(counts.values()) >= max(_MIN_OBSERVATIONS, contradicted)
-    return tuple(out) if swings else ()
+    return _join_runs(seen) if swings else ()
 
 
-def is_passage_observed(door: Door, recording: Recording, poses: Float) -> bool:
+def is_passage_observed(door: Door, known: LabelledRecording) -> bool:
     """True if beams passed through one position of the leaf while it was in the other one.
 
     Two sides of a box that are seen in turn look like a leaf otherwise.
     """
     positions: tuple[tuple[Position, float], ...] = (("open", door.shut), ("shut", door.opened))
     for position, direction in positions:
-        scans = _scans_during(door, position, recording.stamp_ns)
+        scans = _scans_during(door, position, known.recording.stamp_ns)
         along = np.array([np.cos(direction), np.sin(direction)])
         ends = np.array(door.hinge) + door.length * np.array(_CROSSED)[:, None] * along
-        if len(_find_crossing(ends, scans, recording, poses)) >= _MIN_CROSSING:
+        if len(_find_crossing(ends, scans, known)) >= _MIN_CROSSING:
             return True
     return False
 
 
-def observe_passages(ends: Float, observations: Int64, recording: Recording, poses: Float) -> Index:
+def observe_passages(ends: Float, observations: Int64, known: LabelledRecording) -> Index:
     """(n,) scans whose beams passed through a leaf while nothing was seen there.
 
     None where fewer than three did, or where the leaf was never seen. At most 500 scans are looked
@@ -141,31 +128,32 @@ def observe_passages(ends: Float, observations: Int64, recording: Recording, pos
     Args:
         ends: (2, 2) m, of the leaf.
         observations: (L, 2) from `observe_leaves`.
-        recording, poses: see `observe_states`.
+        known: see `observe_states`.
     """
-    stamp_ns = recording.stamp_ns
+    stamp_ns = known.recording.stamp_ns
     seen = np.zeros(len(stamp_ns), bool)
     for first, last in observations:
         seen |= (stamp_ns >= first - _AROUND_NS) & (stamp_ns <= last + _AROUND_NS)
-    sensor = recording.T_map_sensor(poses)[:, :2, 2]
+    sensor = known.recording.T_map_sensor(known.poses)[:, :2, 2]
     is_near = np.linalg.norm(sensor - ends.mean(axis=0), axis=1) <= _MAX_DISTANCE
     inner = ends[0] + np.array(INNER)[:, None] * (ends[1] - ends[0])
-    scans = _find_crossing(inner, _thin(np.flatnonzero(is_near & ~seen)), recording, poses)
+    scans = _find_crossing(inner, _thin(np.flatnonzero(is_near & ~seen)), known)
     return scans if len(scans) >= _MIN_CROSSING else scans[:0]
 
 
-def measure_slope(ends: Float, observations: Int64, recording: Recording, poses: Float) -> float:
+def measure_slope(ends: Float, observations: Int64, known: LabelledRecording) -> float:
     """Slope against a leaf of the surface that some observations hit along it; NaN: there is none.
 
     Args:
-        ends, observations, recording, poses: see `observe_passages`.
+        ends, observations, known: see `observe_passages`.
     """
+    recording = known.recording
     first, last = observations[:, :1], observations[:, 1:]
     seen = ((recording.stamp_ns >= first) & (recording.stamp_ns <= last)).any(axis=0)
     beam, _ = _list_hits(_thin(np.flatnonzero(seen)), recording)
     length = float(np.linalg.norm(ends[1] - ends[0]))
     u = (ends[1] - ends[0]) / length
-    off = recording.end_points(beam, poses) - ends[0]
+    off = recording.end_points(beam, known.poses) - ends[0]
     along, across = off @ u, _cross(u, off)
     inner = (along > INNER[0] * length) & (along < INNER[1] * length) & (np.abs(across) < _ASIDE)
     if np.count_nonzero(inner) < 2:
@@ -179,8 +167,13 @@ def list_runs(position: Position, observations: Int64, passages: Int64) -> tuple
     opposite: Position = "shut" if position == "open" else "open"
     seen = [DoorState(position, first, last) for first, last in observations.tolist()]
     seen += [DoorState(opposite, stamp, stamp) for stamp in passages.tolist()]
+    return _join_runs(sorted(seen, key=lambda state: state.since_ns))
+
+
+def _join_runs(seen: Sequence[DoorState]) -> tuple[DoorState, ...]:
+    """States with those of one position that follow each other joined."""
     out: list[DoorState] = []
-    for state in sorted(seen, key=lambda state: state.since_ns):
+    for state in seen:
         same = bool(out) and out[-1].position == state.position
         out.append(state._replace(since_ns=out.pop().since_ns) if same else state)
     return tuple(out)
@@ -200,26 +193,23 @@ def _thin(scans: Index) -> Index:
     return scans[:: -(-len(scans) // _MAX_SCANS) or 1]
 
 
-def find_hit_cells(scans: Index, recording: Recording, poses: Float, resolution: float) -> Cells:
+def find_hit_cells(scans: Index, known: LabelledRecording) -> Cells:
     """(n, 2) cells in which the beams of some scans ended."""
-    beam, _ = _list_hits(scans, recording)
-    return np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)
+    return known.end_cells(_list_hits(scans, known.recording)[0])
 
 
 def _list_hits(scans: Index, recording: Recording) -> tuple[Index, Index]:
     """(n,) beams of some scans that hit something, and which of these scans they are of."""
-    first, count = recording.offset[scans], np.diff(recording.offset)[scans]
-    of = np.repeat(np.arange(len(scans)), count)
-    beam = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + first[of]
+    of, beam = expand_ranges(recording.offset[scans], np.diff(recording.offset)[scans])
     hit = recording.hit[beam]
     return beam[hit], of[hit]
 
 
-def _find_crossing(ends: Float, scans: Index, recording: Recording, poses: Float) -> Index:
+def _find_crossing(ends: Float, scans: Index, known: LabelledRecording) -> Index:
     """Those of some scans of which a beam crosses the segment between ends (2, 2) and goes on."""
-    beam, of = _list_hits(scans, recording)
-    T = recording.T_map_sensor(poses)[scans]
-    start, end = T[of, :2, 2], recording.end_points(beam, poses)
+    beam, of = _list_hits(scans, known.recording)
+    T = known.recording.T_map_sensor(known.poses)[scans]
+    start, end = T[of, :2, 2], known.recording.end_points(beam, known.poses)
     a, b = ends
     side = np.stack([_cross(end - start, post - start) for post in (a, b)])
     beyond = _cross(b - a, end - a) * np.sign(_cross(b - a, start - a))

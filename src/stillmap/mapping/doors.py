@@ -1,6 +1,7 @@
 """Doors: the sector that a leaf sweeps, fitted to the cells where it was observed."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -145,6 +146,14 @@ class DoorState(NamedTuple):
     until_ns: int
 
 
+def measure_states(states: Iterable[DoorState]) -> dict[Position, int]:
+    """Nanoseconds for which leaves were seen in either position."""
+    out: dict[Position, int] = {"open": 0, "shut": 0}
+    for state in states:
+        out[state.position] += state.until_ns - state.since_ns
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Door(ShortRepr):
     """A leaf that swings about a hinge.
@@ -177,7 +186,5 @@ class Door(ShortRepr):
             return "open" if state == "open" else "shut"
         if state == "last" or len(self.states) == 1:
             return self.states[-1].position
-        seconds = {"open": 0, "shut": 0}
-        for past in self.states:
-            seconds[past.position] += past.until_ns - past.since_ns
-        return "open" if seconds["open"] >= seconds["shut"] else "shut"
+        lasts = measure_states(self.states)
+        return "open" if lasts["open"] >= lasts["shut"] else "shut"

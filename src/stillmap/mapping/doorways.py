@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core.array_types import Cells, Float, Index
-from stillmap.mapping.doors import Door
+from stillmap.mapping.doors import Door, measure_states
 from stillmap.mapping.resting_leaf import SurfaceField
 
 _DIRECTIONS = 60  # of half a turn, of which walls may have some
@@ -129,6 +129,7 @@ class LoneLeaf(NamedTuple):
         shut, leaf: (2,) unit directions from the hinge to the other end of the doorway, and along
             the leaf.
         cells: (K, 2) of it, without those at the edge of the wall.
+        is_open: in which position it was.
         roughness: cells, standard deviation of its surface from a line; 0 of a shut one.
     """
 
@@ -137,6 +138,7 @@ class LoneLeaf(NamedTuple):
     shut: Float
     leaf: Float
     cells: Cells
+    is_open: bool
     roughness: float = 0.0
 
 
@@ -158,9 +160,7 @@ def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
         doorway: a gap in a wall.
         surface: (S, 2) occupied cells.
     """
-    middle, reach = doorway.ends.mean(axis=0), doorway.width + 14.0
-    near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
-    field = SurfaceField(near, middle, reach)
+    field = SurfaceField(surface, doorway.ends.mean(axis=0), doorway.width + 14.0)
     best: tuple[float, LoneLeaf | None] = 0.0, None
     u = (doorway.ends[1] - doorway.ends[0]) / doorway.width
     for v in (np.array([-u[1], u[0]]), np.array([u[1], -u[0]])):
@@ -168,7 +168,7 @@ def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
             score, cells = _rate_leaf(field, doorway, u, back * v)
             if score > best[0]:
                 hinge = doorway.ends[0] + back * v
-                best = score, LoneLeaf(hinge, doorway.width, u, u, cells)
+                best = score, LoneLeaf(hinge, doorway.width, u, u, cells, False)
     return best[1]
 
 
@@ -192,10 +192,7 @@ def _rate_leaf(
         if hidden:
             more = np.arange(-1.0, hidden + _ASIDE[0])[:, None] * outwards
             row = np.concatenate([row, end + recess + more])
-    across = recess / np.linalg.norm(recess)
-    points = np.concatenate([row + k * across for k in (-1.0, 0.0, 1.0)])
-    cells = np.unique(np.round(points).astype(np.int64), axis=0)
-    return covered + exact, cells[field.sample(field.is_surface, cells)]
+    return covered + exact, field.cells_along(row, recess / np.linalg.norm(recess))
 
 
 def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
@@ -219,7 +216,6 @@ def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
 
 def estimate_shut_share(doors: Sequence[Door]) -> float:
     """Share of the time for which doors are shut, by those that were seen to swing."""
-    seconds = {"open": 0.5 * _PRIOR_SECONDS, "shut": 0.5 * _PRIOR_SECONDS}
-    for state in (state for door in doors for state in door.states):
-        seconds[state.position] += 1e-9 * (state.until_ns - state.since_ns)
-    return seconds["shut"] / (seconds["open"] + seconds["shut"])
+    lasts = measure_states(state for door in doors for state in door.states)
+    shut, whole = (1e-9 * span for span in (lasts["shut"], sum(lasts.values())))
+    return (0.5 * _PRIOR_SECONDS + shut) / (_PRIOR_SECONDS + whole)

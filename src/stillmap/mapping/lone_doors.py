@@ -12,27 +12,13 @@ import numpy as np
 
 import stillmap._core as _core
 from stillmap import em
-from stillmap.core import arrays
 from stillmap.core.array_types import Cells, Float, Float32, Index, Int64
 from stillmap.core.chunks import iter_beams
-from stillmap.core.recording import Recording
 from stillmap.core.square_box import cell_keys
-from stillmap.mapping.door_states import (
-    INNER,
-    find_hit_cells,
-    list_runs,
-    measure_slope,
-    observe_leaves,
-    observe_passages,
-)
+from stillmap.mapping import door_states, doorways
 from stillmap.mapping.doors import Door, DoorState
-from stillmap.mapping.doorways import (
-    LoneLeaf,
-    estimate_p_door,
-    estimate_shut_share,
-    find_doorways,
-    find_shut_leaf,
-)
+from stillmap.mapping.doorways import LoneLeaf
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.lone_leaves import find_open_leaf, is_doorway_free, is_thin
 
 _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
@@ -112,104 +98,91 @@ _THREADS = 2  # that count beams: every one has a heap of its own
 _MAX_COMMON = 0.3  # share of the cells of a leaf that may be of another door
 
 
-def find_lone_doors(
-    surface: Cells,
-    doors: Sequence[Door],
-    recording: Recording,
-    poses: Float,
-    resolution: float,
-    threads: int = 1,
-) -> list[Door]:
+def find_lone_doors(surface: Cells, doors: Sequence[Door], known: LabelledRecording) -> list[Door]:
     """Doors whose leaf was in the same position whenever it was seen.
 
     Args:
         surface: (S, 2) cells that are occupied most of the time.
         doors: those that were seen to swing.
-        recording: 2D.
-        poses: (T, 3, 3) T_map_base.
-        resolution: m, edge of a cell.
-        threads: number of threads; the result does not depend on it.
+        known: 2D.
     """
-    doorways = find_doorways(surface, resolution)
-    if not doorways:
+    gaps = doorways.find_doorways(surface, known.resolution)
+    if not gaps:
         return []
-    counts = _count_beams(recording, poses, resolution, threads)
-    free = [doorway for doorway in doorways if is_doorway_free(doorway, counts)]
-    found = [(find_open_leaf(doorway, surface), True) for doorway in free]
-    found += [(find_shut_leaf(doorway, surface), False) for doorway in free]
-    taken = [door.swept_cells for door in doors]
-    leaves: list[tuple[LoneLeaf, bool]] = []
-    for leaf, is_open in found:
+    counts = _count_beams(known)
+    free = [gap for gap in gaps if is_doorway_free(gap, counts)]
+    found = [
+        find(gap, surface) for find in (find_open_leaf, doorways.find_shut_leaf) for gap in free
+    ]
+    taken, leaves = [door.swept_cells for door in doors], list[LoneLeaf]()
+    for leaf in found:
         if leaf is None or not len(leaf.cells):  # of coarse cells, all may be at the wall
             continue
-        is_leaf = not is_open or is_thin(leaf, counts)
+        is_leaf = not leaf.is_open or is_thin(leaf, counts)
         if is_leaf and not any(_is_part(leaf.cells, cells) for cells in taken):
             taken.append(leaf.cells)
-            leaves.append((leaf, is_open))
-    return _observe(leaves, doors, recording, poses, resolution)
+            leaves.append(leaf)
+    return _observe(leaves, doors, known)
 
 
-def _count_beams(
-    recording: Recording, poses: Float, resolution: float, threads: int
-) -> _core.OccupancyGrid2D:
+def _count_beams(known: LabelledRecording) -> _core.OccupancyGrid2D:
     """Counts of the hits of some scans, as if all were static."""
+    recording, threads = known.recording, min(known.threads, _THREADS)
     seconds = 1e-9 * float(recording.stamp_ns[-1] - recording.stamp_ns[0])
     every = max(1, int(_LOOK * recording.n_scans / max(seconds, _LOOK)))
-    counts = _core.OccupancyGrid2D(resolution, moments=False)
-    for scans, _, (points, hit, offset, T_map_sensor) in iter_beams(recording, poses):
+    counts = _core.OccupancyGrid2D(known.resolution, moments=False)
+    for scans, _, (points, hit, offset, T_map_sensor) in iter_beams(recording, known.poses):
         is_looked_at = np.arange(scans.start, scans.stop) % every == 0
         used = hit & np.repeat(is_looked_at, np.diff(offset))
         ends = np.where(used[:, None], points, np.float32(np.nan))
         weights = np.ones(len(used), np.float32)
-        _core.add_beams(counts, ends, used, weights, offset, T_map_sensor, min(threads, _THREADS))
+        _core.add_beams(counts, ends, used, weights, offset, T_map_sensor, threads)
     return counts
 
 
 def _observe(
-    leaves: Sequence[tuple[LoneLeaf, bool]],
-    doors: Sequence[Door],
-    recording: Recording,
-    poses: Float,
-    resolution: float,
+    leaves: Sequence[LoneLeaf], doors: Sequence[Door], known: LabelledRecording
 ) -> list[Door]:
-    """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
-    observations = observe_leaves([leaf.cells for leaf, _ in leaves], recording, poses, resolution)
+    """The doors with these leaves, when they were seen, and P(moved)."""
+    stamp_ns = known.recording.stamp_ns
+    observations = door_states.observe_leaves([leaf.cells for leaf in leaves], known)
     passed_doors, lone_doors, lone_observations = list[Door](), list[Door](), list[Int64]()
-    for (leaf, is_open), seen in zip(leaves, observations, strict=True):
+    for leaf, seen in zip(leaves, observations, strict=True):
         if not len(seen):
             continue
         passed = np.empty(0, np.intp)
-        if not is_open:
-            leaf, passed = _find_passages(leaf, seen, recording, poses, resolution)
-        states = list_runs("open" if is_open else "shut", seen, recording.stamp_ns[passed])
-        door = _make_door(leaf, is_open, resolution, states)
+        if not leaf.is_open:
+            leaf, passed = _find_passages(leaf, seen, known)
+        states = door_states.list_runs("open" if leaf.is_open else "shut", seen, stamp_ns[passed])
+        door = _make_door(leaf, known.resolution, states)
         if len(passed):
             passed_doors.append(door)
         else:
             lone_doors.append(door)
             lone_observations.append(seen)
-    swung = [*doors, *passed_doors]
-    rated = _rate_lone(lone_doors, lone_observations, swung, recording.stamp_ns)
+    rated = _rate_lone(lone_doors, lone_observations, [*doors, *passed_doors], stamp_ns)
     return [*passed_doors, *rated]
 
 
 def _find_passages(
-    leaf: LoneLeaf, observations: Int64, recording: Recording, poses: Float, resolution: float
+    leaf: LoneLeaf, observations: Int64, known: LabelledRecording
 ) -> tuple[LoneLeaf, Index]:
     """A shut leaf without what is hit while beams pass through it, and the scans of these.
 
     What is hit then is the edge of a wall; where little else is left, it is no leaf that moved. Nor
     is it one if the surface that was seen there does not lie along the doorway.
     """
-    ends = resolution * (leaf.hinge + 0.5 + np.outer([0.0, leaf.length], leaf.shut))
-    scans = observe_passages(ends, observations, recording, poses)
-    hit = find_hit_cells(scans, recording, poses, resolution)
+    ends = known.resolution * (leaf.hinge + 0.5 + np.outer([0.0, leaf.length], leaf.shut))
+    scans = door_states.observe_passages(ends, observations, known)
+    hit = door_states.find_hit_cells(scans, known)
     moved = leaf._replace(cells=leaf.cells[~np.isin(cell_keys(leaf.cells), cell_keys(hit))])
     along = np.round((moved.cells - leaf.hinge) @ leaf.shut)
-    inner = np.arange(math.ceil(INNER[0] * leaf.length), INNER[1] * leaf.length)
+    inner = np.arange(
+        math.ceil(door_states.INNER[0] * leaf.length), door_states.INNER[1] * leaf.length
+    )
     if np.isin(inner, along).mean() < _MIN_MOVED:
         return leaf, scans[:0]
-    if not abs(measure_slope(ends, observations, recording, poses)) <= _MAX_SLOPE:
+    if not abs(door_states.measure_slope(ends, observations, known)) <= _MAX_SLOPE:
         return leaf, scans[:0]
     return moved, scans
 
@@ -221,8 +194,8 @@ def _rate_lone(
     is_open = np.array([len(door.open_cells) > 0 for door in lone], bool)
     same, moved = compute_p_moved(swung, observations, stamp_ns)
     p_door = np.full(len(lone), _P_LEAF)
-    p_shut = estimate_shut_share(swung) * same[~is_open]
-    p_door[~is_open] = estimate_p_door(p_shut, len(swung) + int(is_open.sum()))
+    p_shut = doorways.estimate_shut_share(swung) * same[~is_open]
+    p_door[~is_open] = doorways.estimate_p_door(p_shut, len(swung) + int(is_open.sum()))
     return [
         dataclasses.replace(lone[k], p_moved=float(moved[k] * p_door[k]))
         for k in np.flatnonzero(p_door >= _MIN_P_LISTED).tolist()
@@ -233,18 +206,16 @@ def _is_part(cells: Cells, others: Cells) -> bool:
     return bool(np.isin(cell_keys(cells), cell_keys(others)).mean() > _MAX_COMMON)
 
 
-def _make_door(
-    leaf: LoneLeaf, is_open: bool, resolution: float, states: tuple[DoorState, ...]
-) -> Door:
+def _make_door(leaf: LoneLeaf, resolution: float, states: tuple[DoorState, ...]) -> Door:
     x, y = ((leaf.hinge + 0.5) * resolution).tolist()
     none = np.empty((0, 2), np.int64)
     return Door(
         hinge=(x, y),
         length=leaf.length * resolution,
         shut=math.atan2(leaf.shut[1], leaf.shut[0]),
-        opened=math.atan2(leaf.leaf[1], leaf.leaf[0]) if is_open else math.nan,
-        shut_cells=none if is_open else leaf.cells,
-        open_cells=leaf.cells if is_open else none,
+        opened=math.atan2(leaf.leaf[1], leaf.leaf[0]) if leaf.is_open else math.nan,
+        shut_cells=none if leaf.is_open else leaf.cells,
+        open_cells=leaf.cells if leaf.is_open else none,
         swept_cells=leaf.cells,
         states=states,
         p_moved=_P_PASSED,
@@ -252,14 +223,11 @@ def _make_door(
 
 
 def relabel_lone_doors(
-    recording: Recording,
-    poses: Float,
-    p_static: Float32,
+    known: LabelledRecording,
     occupied: em.CellProbabilities,
     histories: em.CellHistories,
     doors: Sequence[Door],
     state: em.MapState,
-    threads: int = 1,
 ) -> tuple[Float32, em.CellProbabilities]:
     """Labels (M,) and map cells with doors whose leaf was seen in one position only.
 
@@ -269,17 +237,15 @@ def relabel_lone_doors(
     niche.
 
     Args:
-        recording: M beams.
-        poses: (T, 3, 3) T_map_base.
-        p_static, occupied: to be changed.
+        known: M beams, with labels to be changed.
+        occupied: to be changed.
         histories: with the surfels of the same cells.
         doors: from `find_lone_doors`.
         state: state of changed places that the map shows.
-        threads: number of threads; the result does not depend on it.
     """
     doors = [door for door in doors if len(door.open_cells) or len(door.states) > 1]
     if not doors:
-        return p_static, occupied
+        return known.p_static, occupied
     keys, p_moved = cell_keys(histories.cells), np.zeros(len(histories.cells), np.float32)
     p_occupied = occupied.p_occupied.copy()
     for door in doors:
@@ -290,9 +256,8 @@ def relabel_lone_doors(
             p_occupied[on_leaf] = 0.0
         elif len(door.states) > 1:  # of what moved all cells are shown
             p_occupied[on_leaf] = histories.p_in_cell[on_leaf]
-    out = arrays.copy(p_static, recording.scratch)
-    for _, beams, data in iter_beams(recording, poses, release=[out]):
-        surfel = histories.surfel_map.associate_beams(*data, threads)
+    out = known.copy_labels()
+    for beams, surfel in known.iter_surfels(histories, out):
         ended = np.flatnonzero(surfel >= 0)
         out[beams][ended] *= 1.0 - p_moved[surfel[ended]]
     return out, dataclasses.replace(occupied, p_occupied=p_occupied)

@@ -13,21 +13,19 @@ from typing import NamedTuple
 import numpy as np
 
 import stillmap._core as _core
-from stillmap.core.array_types import Bool, Cells, Float, Float32
-from stillmap.core.arrays import iter_blocks
-from stillmap.core.recording import Recording
+from stillmap.core import se2
+from stillmap.core.array_types import Bool, Cells, Float
 from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
-from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.mapping import resting_leaf
 from stillmap.mapping.doorways import Doorway, LoneLeaf
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.resting_leaf import SurfaceField
 
 _ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
 _SHIFT = np.array([-0.5, 1.0])  # cells of the hinge into the doorway
 _BACK = np.arange(-1.0, 6.0)  # cells of the hinge behind the face of the wall
 _LONGER = np.arange(-2.0, 5.0)  # cells by which the leaf is longer than the doorway is wide
-_MIN_COVERED, _MIN_EXACT = 0.85, 0.5  # share of the leaf within a cell of surface, and on it
-_MIN_CLEAR, _ASIDE = 0.85, 3.0  # share of the cells so far beside it that are none
-_NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
+_MIN_CLEAR = 0.85  # share of the cells beside the leaf that are none
 _BEYOND = (2.0, 5.0)  # cells beyond its end, which is free
 _NOISE = math.radians(15.0)  # of the swing beside either position
 _RADII = np.array([0.4, 0.55, 0.7, 0.85, 0.97])  # of the leaf, where the swing is looked at
@@ -51,25 +49,22 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
         doorway: a gap in a wall.
         surface: (S, 2) occupied cells.
     """
-    middle = doorway.ends.mean(axis=0)
-    reach = 2.0 * doorway.width + 12.0
-    near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
-    field = SurfaceField(near, middle, reach)
+    field = SurfaceField(surface, doorway.ends.mean(axis=0), 2.0 * doorway.width + 12.0)
     best: tuple[float, LoneLeaf | None] = 0.0, None
     for end, side in itertools.product((0, 1), (-1.0, 1.0)):
         rated = _rate_leaves(field, doorway, end, side)
         if rated is not None and rated[0] > best[0]:
             best = rated
     leaf = best[1]
-    if leaf is None or _goes_on(leaf, near):
+    if leaf is None or _goes_on(leaf, field.cells):
         return None
-    leaf = leaf._replace(roughness=_measure_roughness(leaf, near))
+    leaf = leaf._replace(roughness=_measure_roughness(leaf, field.cells))
     return leaf if leaf.roughness <= _ROUGHNESS + _MORE_ROUGHNESS else None
 
 
 def _goes_on(leaf: LoneLeaf, surface: Cells) -> bool:
     """True if the surface of a leaf goes on behind the hinge."""
-    along, across = _along_and_across(leaf, surface)
+    along, across = se2.along_and_across(surface - leaf.hinge, leaf.leaf)
     behind = (along < -_BEHIND_WALL) & (along > -_BEHIND_WALL - _GOES_ON)
     row = np.unique(np.round(along[behind & (np.abs(across) <= 1.5)]))
     return len(row) > _MAX_GOES_ON
@@ -77,18 +72,12 @@ def _goes_on(leaf: LoneLeaf, surface: Cells) -> bool:
 
 def _measure_roughness(leaf: LoneLeaf, surface: Cells) -> float:
     """Standard deviation of the surface of a leaf from a line, cells."""
-    along, across = _along_and_across(leaf, surface)
-    of_leaf = (along > _NEAR_HINGE * leaf.length) & (along < leaf.length)
+    along, across = se2.along_and_across(surface - leaf.hinge, leaf.leaf)
+    of_leaf = (along > resting_leaf.NEAR_HINGE * leaf.length) & (along < leaf.length)
     of_leaf &= np.abs(across) <= _BAND
     line = np.column_stack([along[of_leaf], np.ones(np.count_nonzero(of_leaf))])
     fitted = line @ np.linalg.lstsq(line, across[of_leaf], rcond=None)[0]
     return float(np.sqrt(np.mean((across[of_leaf] - fitted) ** 2)))
-
-
-def _along_and_across(leaf: LoneLeaf, cells: Cells) -> tuple[Float, Float]:
-    """Coordinates of cells from the hinge of a leaf, along it and across."""
-    off = cells - leaf.hinge
-    return off @ leaf.leaf, off @ np.array([-leaf.leaf[1], leaf.leaf[0]])
 
 
 def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
@@ -103,7 +92,7 @@ def is_thin(leaf: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
     across = np.array([-leaf.leaf[1], leaf.leaf[0]])
     if across @ leaf.shut < 0.0:
         across = -across
-    t = np.arange(_NEAR_HINGE * leaf.length + 1.0, leaf.length)
+    t = np.arange(resting_leaf.NEAR_HINGE * leaf.length + 1.0, leaf.length)
     row = leaf.hinge + t[:, None] * leaf.leaf
     inside, behind = (
         max(_passed_share(counts, row + k * side * across) for k in _BESIDE) for side in (1.0, -1.0)
@@ -120,21 +109,16 @@ def _passed_share(counts: _core.OccupancyGrid2D, points: Float) -> float:
 
 
 class _Hypotheses(NamedTuple):
-    """H leaves of any length at one end of a doorway, sampled at every cell along them, N of them.
+    """H leaves of any length at one end of a doorway.
 
     Attributes:
         hinge, leaf: (H, 2).
         angle: (H,) rad from the doorway.
-        row: (H, N, 2) cells along each.
-        is_near, is_on: (H, N) whether they are within a cell of surface, and on it.
     """
 
     hinge: Float
     leaf: Float
     angle: Float
-    row: Float
-    is_near: Bool
-    is_on: Bool
 
     def select(self, kept: Bool) -> "_Hypotheses":
         return _Hypotheses._make(column[kept] for column in self)
@@ -146,71 +130,47 @@ def _rate_leaves(
     """Score and shape of the best leaf hinged at one end of a doorway, towards one side of it."""
     u = (doorway.ends[1 - end] - doorway.ends[end]) / doorway.width
     v = side * np.array([-u[1], u[0]])
-    t = _along(doorway)
     every = _sample_leaves(field, doorway, doorway.ends[end], u, v)
-    if every is not None:
-        every = every.select(_swept_share(field, doorway.width, every, u, v) <= _MAX_SWEPT)
-    if every is None or not len(every.hinge):
+    every = every.select(_swept_share(field, doorway.width, every, u, v) <= _MAX_SWEPT)
+    if not len(every.hinge):
         return None
-    across = every.leaf[:, ::-1] * [-1.0, 1.0]
-    rows = [every.row + k * across[:, None] for k in np.arange(-_ASIDE, _ASIDE + 1.0)]
-    aside = np.stack([field.sample(field.is_surface, row) for row in rows])
     best: tuple[float, LoneLeaf] | None = None
     for length in doorway.width + _LONGER:
-        score = _score_leaves(every, aside, t, length)
+        t = _count_up(length + _BEYOND[1])
+        points = every.hinge[:, None] + t[:, None] * every.leaf[:, None]
+        row, beyond = points[:, t <= length], points[:, t >= length + _BEYOND[0]]
+        is_far = t[t <= length] >= resting_leaf.NEAR_HINGE * length
+        score = resting_leaf.score_leaves(field, row, beyond, every.leaf, is_far, _MIN_CLEAR)
         k = int(score.argmax())
         if score[k] > (best[0] if best else 0.0):
-            points = [every.row[k, t <= length] + j * across[k] for j in (-1.0, 0.0, 1.0)]
-            cells = np.unique(np.round(np.concatenate(points)).astype(np.int64), axis=0)
-            cells = cells[field.sample(field.is_surface, cells)]
+            cells = field.cells_along(row[k], every.leaf[k, ::-1] * [-1.0, 1.0])
             cells = cells[(cells - doorway.ends[end]) @ v > _JAMB]
-            best = float(score[k]), LoneLeaf(every.hinge[k], length, u, every.leaf[k], cells)
+            best = float(score[k]), LoneLeaf(every.hinge[k], length, u, every.leaf[k], cells, True)
     return best
 
 
 def _sample_leaves(
     field: SurfaceField, doorway: Doorway, end: Float, u: Float, v: Float
-) -> _Hypotheses | None:
-    """Those that lie on surface over the shortest length; None: there are none."""
+) -> _Hypotheses:
+    """Those that lie on surface over the shortest length."""
     grids = np.meshgrid(_SHIFT, _BACK, _ANGLES, indexing="ij")
     shift, back, angle = (grid.ravel() for grid in grids)
     hinge = end + shift[:, None] * u + back[:, None] * v
     leaf = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
-    t = _along(doorway)
-    least = t[t <= doorway.width + _LONGER[0]]
+    least = _count_up(doorway.width + _LONGER[0])
     kept = np.arange(len(angle))
-    for layer, share in ((field.is_near, _MIN_COVERED), (field.is_surface, _MIN_EXACT)):
+    for layer, share in (
+        (field.is_near, resting_leaf.MIN_COVERED),
+        (field.is_surface, resting_leaf.MIN_EXACT),
+    ):
         row = hinge[kept, None] + least[:, None] * leaf[kept, None]
         kept = kept[field.sample(layer, row).mean(axis=1) >= share]
-    if not len(kept):
-        return None
-    row = hinge[kept, None] + t[:, None] * leaf[kept, None]
-    is_near, is_on = (field.sample(layer, row) for layer in (field.is_near, field.is_surface))
-    return _Hypotheses(hinge[kept], leaf[kept], angle[kept], row, is_near, is_on)
+    return _Hypotheses(hinge[kept], leaf[kept], angle[kept])
 
 
-def _along(doorway: Doorway) -> Float:
-    """(N,) cells from the hinge, as far as leaves are looked at."""
-    return np.arange(1.0, doorway.width + _LONGER[-1] + _BEYOND[1])
-
-
-def _score_leaves(every: _Hypotheses, aside: Bool, t: Float, length: float) -> Float:
-    """(H,) score of the leaves of one length; 0 where there is none.
-
-    Args:
-        every: H leaves.
-        aside: (A, H, N) surface in rows beside them, from one side to the other.
-        t: (N,) cells from the hinge.
-        length: cells.
-    """
-    on = t <= length
-    far = on & (t >= _NEAR_HINGE * length)
-    beyond = (t >= length + _BEYOND[0]) & (t <= length + _BEYOND[1])
-    covered, exact = every.is_near[:, on].mean(axis=1), every.is_on[:, on].mean(axis=1)
-    clear = 1.0 - aside[[0, -1]][:, :, far].mean(axis=2).max(axis=0)
-    good = ~aside[:, :, beyond].any(axis=(0, 2)) & (clear >= _MIN_CLEAR)
-    good &= (covered >= _MIN_COVERED) & (exact >= _MIN_EXACT)
-    return np.where(good, covered + exact + clear, 0.0)
+def _count_up(last: float) -> Float:
+    """(N,) 1, 2, ... up to `last`: cells from the hinge."""
+    return np.arange(1.0, math.floor(last) + 1.0)
 
 
 def _swept_share(
@@ -231,26 +191,15 @@ _MIN_CELLS = 6
 _MIDDLE, _ANGLE = 4.0, 8  # cells, and parts of half a turn, by which lines of one leaf may differ
 
 
-def find_leaf_lines(
-    recording: Recording, poses: Float, p_static: Float32, resolution: float
-) -> list[Cells]:
-    """Cells (K, 2) of each straight row of dynamic hits that may be a leaf.
-
-    Args:
-        recording: 2D, M beams.
-        poses: (T, 3, 3) T_map_base.
-        p_static: (M,) of each beam.
-        resolution: m, edge of a cell.
-    """
+def find_leaf_lines(known: LabelledRecording) -> list[Cells]:
+    """Cells (K, 2) of each straight row of dynamic hits, in 2D, that may be a leaf."""
+    recording = known.recording
     lines: dict[tuple[int, ...], list[Cells]] = {}
-    for block in iter_blocks(recording.hit, p_static):
-        dynamic = recording.hit[block] & (p_static[block] < DYNAMIC_BELOW)
-        beam = block.start + np.flatnonzero(dynamic)
-        cells = np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)
+    for beam in known.iter_hits(dynamic=True):
         stamp = recording.stamp_ns[recording.scans_of(beam)]
         second = (stamp - recording.stamp_ns[0]) // _BIN_NS
-        seen = np.unique(np.column_stack([cells, second]), axis=0)
-        for place, line in _find_lines(seen, resolution) if len(seen) else ():
+        seen = np.unique(np.column_stack([known.end_cells(beam), second]), axis=0)
+        for place, line in _find_lines(seen, known.resolution) if len(seen) else ():
             lines.setdefault(place, []).append(line)
     return [np.unique(np.concatenate(parts), axis=0) for _, parts in sorted(lines.items())]
 

@@ -172,6 +172,10 @@ class CrossingBeams(NamedTuple):
     along: Float
     fit: Bool
 
+    def select(self, chosen: Bool) -> "CrossingBeams":
+        """Some of the beams (N,)."""
+        return CrossingBeams._make(column[chosen] for column in self)
+
 
 def tangent_of(normal: Float) -> Float:
     """(2,) unit vector along a line of unit normal (2,)."""
@@ -194,18 +198,18 @@ def check_mirror(
         beams: all beams.
         surfaces: what is static.
     """
-    within = (crossing.along >= mirror.first) & (crossing.along <= mirror.last)
-    origins, ends = crossing.origins[within], crossing.ends[within]
+    is_within = (crossing.along >= mirror.first) & (crossing.along <= mirror.last)
+    within = crossing.select(is_within)
     has_wall_behind = _has_wall_behind(mirror, beams)
     needed = _MIN_SHARES_IF_BACKED if has_wall_behind else _MIN_SHARES
-    if not _shows_reflections(mirror, origins, ends, beams.path, surfaces, needed):
+    if not _shows_reflections(mirror, within, beams.path, surfaces, needed):
         return None
     if has_wall_behind:
         return _widen_to_back(mirror, beams)
     is_mirror = (
-        _has_edges(crossing.along[within], crossing.along[~within & ~crossing.fit], mirror)
+        _has_edges(within.along, crossing.along[~is_within & ~crossing.fit], mirror)
         and _has_frame(mirror, beams.ends)
-        and not _is_seen_without_mirror(mirror, beams, ends, surfaces.resolution)
+        and not _is_seen_without_mirror(mirror, beams, within.ends, surfaces.resolution)
     )
     if not is_mirror:
         return None
@@ -277,33 +281,32 @@ def _is_seen_without_mirror(mirror: Mirror, beams: Beams, ends: Float, resolutio
 
 def _shows_reflections(
     mirror: Mirror,
-    origins: Float,
-    ends: Float,
+    crossing: CrossingBeams,
     path: Float,
     surfaces: SurfaceCells,
     min_shares: tuple[float, float],
 ) -> bool:
     """True if the end points behind the line, reflected at it, lie on surfaces in free view."""
-    normal, distance = mirror.normal, mirror.distance
-    if len(ends) < MIN_BEAMS or np.linalg.norm(np.ptp(origins, axis=0)) < _MIN_TRAVEL:
+    normal, distance, fit = mirror.normal, mirror.distance, crossing.fit
+    if len(fit) < MIN_BEAMS or np.linalg.norm(np.ptp(crossing.origins, axis=0)) < _MIN_TRAVEL:
         return False
     before = path @ normal - distance  # a robot drives through openings, not through mirrors
     passing = np.flatnonzero(before[:-1] * before[1:] < 0.0)
     gone = path[passing] @ tangent_of(normal)
     if np.any((gone >= mirror.first) & (gone <= mirror.last)):
         return False
-    fit = surfaces.are_near(reflect(ends, normal, distance))
-    beside = [surfaces.are_near(reflect(ends, normal, distance + o)) for o in _CONTROL]
+    beside = [surfaces.are_near(reflect(crossing.ends, normal, distance + o)) for o in _CONTROL]
     telling = np.sum(beside, axis=0) <= 1
     if np.count_nonzero(fit) < min_shares[0] * len(fit) or np.count_nonzero(telling) < MIN_BEAMS:
         return False
     if np.count_nonzero(fit & telling) < min_shares[1] * np.count_nonzero(telling):
         return False
-    return _blocked_share(mirror, origins, ends, surfaces) <= _MAX_BLOCKED
+    return _blocked_share(mirror, crossing, surfaces) <= _MAX_BLOCKED
 
 
-def _blocked_share(mirror: Mirror, origins: Float, ends: Float, surfaces: SurfaceCells) -> float:
+def _blocked_share(mirror: Mirror, crossing: CrossingBeams, surfaces: SurfaceCells) -> float:
     """Share of the beams that would pass through surfaces if the mirror reflected them."""
+    origins, ends = crossing.origins, crossing.ends
     reflected = reflect(ends, mirror.normal, mirror.distance)
     front, behind = origins @ mirror.normal, mirror.distance - ends @ mirror.normal
     share = (front - mirror.distance) / (front - mirror.distance + behind)

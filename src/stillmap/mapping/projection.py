@@ -6,7 +6,7 @@ a planar scan, and all 2D steps apply.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -91,16 +91,27 @@ def project_to_plane(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     planar_poses = se2.project_to_plane(T_map_sensor)
-    settings = _kernel_settings(ground, band, cell, open_space)
+    corner_x, corner_y = ground.corner.tolist()
+    project = partial(
+        _core.project_scan,
+        height=np.ascontiguousarray(ground.height),
+        corner_x=corner_x,
+        corner_y=corner_y,
+        edge=GROUND_SQUARE,
+        low=band[0],
+        high=band[1],
+        top=max(band[1], ground.sensor_height + _SENSOR_MARGIN),
+        cell=cell,
+        directions=DIRECTIONS,
+        open_space=open_space,
+    )
     scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
     ends, hits = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
     numbers = ArrayBuilder(np.intp, (), scratch)
 
     def process(t: int) -> tuple[Float32, Bool, Index]:
         beams = recording.beams_of(t)
-        xy, hit, number = _core.project_scan(
-            recording.points[beams], recording.hit[beams], T_map_sensor[t], **settings
-        )
+        xy, hit, number = project(recording.points[beams], recording.hit[beams], T_map_sensor[t])
         local = (xy - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
         return local.astype(np.float32), hit.view(np.bool_), beams.start + number
 
@@ -112,26 +123,6 @@ def project_to_plane(
         offset[t + 1] = offset[t] + len(number)
     flat = make_planar_recording(recording, ends.finish(), hits.finish(), offset)
     return PlanarProjection(flat, planar_poses, numbers.finish())
-
-
-def _kernel_settings(
-    ground: GroundMap, band: tuple[float, float], cell: float, open_space: bool
-) -> dict[str, Any]:
-    """Arguments of `_core.project_scan` that are those of all scans."""
-    low, high = band
-    corner_x, corner_y = ground.corner.tolist()
-    return {
-        "height": np.ascontiguousarray(ground.height),
-        "corner_x": corner_x,
-        "corner_y": corner_y,
-        "edge": GROUND_SQUARE,
-        "low": low,
-        "high": high,
-        "top": max(high, ground.sensor_height + _SENSOR_MARGIN),
-        "cell": cell,
-        "directions": DIRECTIONS,
-        "open_space": open_space,
-    }
 
 
 def project_cells(

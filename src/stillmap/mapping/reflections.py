@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
@@ -54,8 +53,7 @@ def remove_reflections(
             break
         more = find_reflections(recording, poses, mirrors)
         reflected = more if reflected is None else reflected | more
-        points = arrays.copy(recording.points, recording.scratch)
-        hit = arrays.copy(recording.hit, recording.scratch)
+        points, hit = recording.copy_beams()
         points[more], hit[more] = np.nan, False
         recording = replace(recording, points=points, hit=hit)
     return recording, reflected

@@ -18,10 +18,10 @@ _MAX_WIDTH = 5.0  # cells of it across
 _MIN_ON_LINE, _REFITS = 0.65, 3  # share of the cells of the change
 _MAX_HIDDEN = 0.15  # m of the line that is not seen to change beside the jambs
 _ANGLES = np.radians(np.arange(40.0, 161.0, 3.0))  # between both positions
-_MIN_COVERED, _MIN_EXACT = 0.85, 0.5  # share of the leaf within a cell of surface, and on it
+MIN_COVERED, MIN_EXACT = 0.85, 0.5  # share of the leaf within a cell of surface, and on it
 _MIN_CLEAR = 0.9  # share of the cells beside the leaf that are none
 _ASIDE = 3.0  # cells to both sides of it
-_NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
+NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
 _BEYOND = (2.5, 5.0)  # cells beyond its end, which is free
 
 
@@ -48,9 +48,7 @@ def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cell
     line = fit_line(changed, resolution)
     if line is None:
         return none
-    reach = 1.5 * line.length + 10.0
-    surface = surface[(np.abs(surface - line.middle) < reach).all(axis=1)]
-    field = SurfaceField(surface, line.middle, reach)
+    field = SurfaceField(surface, line.middle, 1.5 * line.length + 10.0)
     best: tuple[float, Cells] = 0.0, none
     most = round(_MAX_HIDDEN / resolution)
     for end, at_hinge in itertools.product((-1.0, 1.0), range(most + 1)):
@@ -82,13 +80,20 @@ def fit_line(cells: Cells, resolution: float) -> Line | None:
 
 
 class SurfaceField:
-    """Which cells are surface, and which have some within a cell, in a box from `low` on."""
+    """Which cells are surface, and which have some within a cell, in a box from `low` on.
 
-    def __init__(self, cells: Cells, middle: Float, reach: float) -> None:
+    Attributes:
+        cells: (K, 2) those of the surface.
+        is_surface, is_near: see `sample`.
+    """
+
+    def __init__(self, surface: Cells, middle: Float, reach: float) -> None:
+        """Those of cells (S, 2) that are within `reach` of a point along both axes."""
+        self.cells = surface[(np.abs(surface - middle) < reach).all(axis=1)]
         size = 2 * math.ceil(reach) + 6
         self.low = np.floor(middle - reach).astype(np.int64) - 2
         self.is_surface, self.is_near = np.zeros((2, size, size), bool)
-        self.is_surface[tuple((cells - self.low).T)] = True
+        self.is_surface[tuple((self.cells - self.low).T)] = True
         padded = np.pad(self.is_surface, 1)
         for i in range(3):
             for j in range(3):
@@ -101,6 +106,37 @@ class SurfaceField:
         out = np.zeros(points.shape[:-1], bool)
         out[inside] = layer[tuple(at[inside].T)]
         return out
+
+    def cells_along(self, row: Float, across: Float) -> Cells:
+        """(K, 2) those of a row of points (n, 2) and the rows beside it, `across` (2,) of it."""
+        points = np.concatenate([row + k * across for k in (-1.0, 0.0, 1.0)])
+        cells = np.unique(np.round(points).astype(np.int64), axis=0)
+        return cells[self.sample(self.is_surface, cells)]
+
+
+def score_leaves(
+    field: SurfaceField, row: Float, beyond: Float, along: Float, is_far: Bool, min_clear: float
+) -> Float:
+    """(H,) scores of leaves: surface along them, none beside and beyond; 0 where there is none.
+
+    Args:
+        field: of the surface.
+        row: (H, N, 2) cells along each.
+        beyond: (H, K, 2) cells beyond its end, which is free.
+        along: (H, 2) unit directions.
+        is_far: (N,) those of the row that are not near the hinge, where the wall is beside it.
+        min_clear: share of the cells beside it that are none.
+    """
+    across = along[:, None, ::-1] * [-1.0, 1.0]
+    covered = field.sample(field.is_near, row).mean(axis=1)
+    exact = field.sample(field.is_surface, row).mean(axis=1)
+    far = row[:, is_far]
+    beside = [field.sample(field.is_surface, far + k * across) for k in (-_ASIDE, _ASIDE)]
+    clear = 1.0 - np.max([side.mean(axis=1) for side in beside], axis=0)
+    good = (covered >= MIN_COVERED) & (exact >= MIN_EXACT) & (clear >= min_clear)
+    for side in np.arange(-_ASIDE, _ASIDE + 1.0):
+        good &= ~field.sample(field.is_surface, beyond + side * across).any(axis=1)
+    return np.where(good, covered + exact + clear, 0.0)
 
 
 def _rate_leaves(
@@ -117,27 +153,14 @@ def _rate_leaves(
         line: (2,) unit direction from the hinge along the other position.
     """
     turned = math.atan2(line[1], line[0]) + np.concatenate([_ANGLES, -_ANGLES])
-    along = np.stack([np.cos(turned), np.sin(turned)], axis=1)[:, None]
-    t = np.arange(1.0, length)
-    covered = field.sample(field.is_near, hinge + t[:, None] * along).mean(axis=1)
-    kept = covered >= _MIN_COVERED
+    along = np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    t, ahead = np.arange(1.0, length), np.arange(length + _BEYOND[0], length + _BEYOND[1])
+    row = hinge + t[:, None] * along[:, None]
+    kept = field.sample(field.is_near, row).mean(axis=1) >= MIN_COVERED
     if not kept.any():
         return None
-    covered, along = covered[kept], along[kept]
-    across = along[..., ::-1] * [-1.0, 1.0]
-    leaf = hinge + t[:, None] * along
-    exactly = field.sample(field.is_surface, leaf).mean(axis=1)
-    ahead = np.arange(length + _BEYOND[0], length + _BEYOND[1])[:, None]
-    beyond = hinge + ahead * along
-    is_end = np.ones(len(along), bool)
-    for side in np.arange(-_ASIDE, _ASIDE + 1.0):
-        is_end &= ~field.sample(field.is_surface, beyond + side * across).any(axis=1)
-    far = leaf[:, t >= _NEAR_HINGE * length]
-    rows = [field.sample(field.is_surface, far + k * across) for k in (-_ASIDE, _ASIDE)]
-    clear = 1.0 - np.max([row.mean(axis=1) for row in rows], axis=0)
-    good = is_end & (exactly >= _MIN_EXACT) & (clear >= _MIN_CLEAR)
-    score = np.where(good, covered + exactly + clear, 0.0)
+    row, along = row[kept], along[kept]
+    beyond = hinge + ahead[:, None] * along[:, None]
+    score = score_leaves(field, row, beyond, along, t >= NEAR_HINGE * length, _MIN_CLEAR)
     best = int(score.argmax())
-    points = np.concatenate([leaf[best] + k * across[best] for k in (-1.0, 0.0, 1.0)])
-    cells = np.unique(np.round(points).astype(np.int64), axis=0)
-    return float(score[best]), cells[field.sample(field.is_surface, cells)]
+    return float(score[best]), field.cells_along(row[best], along[best, ::-1] * [-1.0, 1.0])

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32, Index
 from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, max_scan_duration_ns
@@ -15,7 +16,7 @@ from stillmap.core.segments import segments_meet_box
 from stillmap.em import GroundMap
 from stillmap.mesh.range_image import has_planar_scans
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import HOLD, MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box, fit_box
+from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box, fit_box
 
 OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
 _OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin
@@ -68,7 +69,7 @@ def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedB
     for one in objects:
         assert one.z is not None
         height = float(one.size[2])
-        boxes.append(TrackedBox(fit_box(one, start_ns, HOLD), one.z - 0.5 * height, height))
+        boxes.append(TrackedBox(fit_box(one, start_ns), one.z - 0.5 * height, height))
     return boxes
 
 
@@ -114,9 +115,7 @@ class ObjectFrame(NamedTuple):
     def to_object(self, seconds: Float, points: Float) -> Float:
         """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
         center, heading, bottom = self.box.pose_at(seconds)
-        off = points[:, :2] - center
-        ahead = (off * heading).sum(axis=1)
-        left = off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1]
+        ahead, left = se2.along_and_across(points[:, :2] - center, heading)
         dx, dy, turn = (np.interp(seconds, self.seconds, column) for column in self.offset.T)
         c, s = np.cos(turn), np.sin(turn)
         x, y = c * ahead - s * left + dx, s * ahead + c * left + dy
@@ -148,8 +147,7 @@ class OrientedBox(NamedTuple):
     def local(self, points: Float) -> Float:
         """(n, 3) metres ahead, to the left and above the center, of map points (n, 3)."""
         off = points - self.center
-        ahead = off[:, :2] @ self.heading
-        left = off[:, 1] * self.heading[0] - off[:, 0] * self.heading[1]
+        ahead, left = se2.along_and_across(off[:, :2], self.heading)
         return np.stack([ahead, left, off[:, 2]], axis=1)
 
 

@@ -12,27 +12,13 @@ from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
 from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
+from stillmap.mesh import view_selection, visibility
 from stillmap.mesh.inputs import MeshInputs, boxes_at, is_in_or_behind_box, occlusion_probability
 from stillmap.mesh.texture import sample_bilinear
 from stillmap.mesh.triangle_mesh import Image, Mesh, Tell, no_tell, subdivide
-from stillmap.mesh.view_selection import (
-    Candidates,
-    estimate_gains,
-    reject_inconsistent_views,
-    sample_face_colors,
-    select_views,
-    view_utility,
-)
+from stillmap.mesh.view_selection import Candidates
 from stillmap.mesh.views import View, read_color_image
-from stillmap.mesh.visibility import (
-    DEPTH_SCALE,
-    NEAR,
-    DepthBuffer,
-    build_occlusion_mask,
-    find_visible_faces,
-    project_pinhole,
-    render_depth,
-)
+from stillmap.mesh.visibility import DepthBuffer
 
 SEAM_COST = 1.0  # e-folds of resolution where two images meet
 _P_UNOBSERVED = 0.9  # that an image shows static surface where no beam tells
@@ -90,20 +76,22 @@ def assign_views(
     candidates = Candidates.empty(len(mesh))
 
     def evaluate(view: View) -> tuple[Index, Float, Float]:
-        pixels = find_visible_faces(mesh, view)
+        pixels = visibility.find_visible_faces(mesh, view)
         faces = np.flatnonzero(pixels)
         p = p_unoccluded(mesh, faces, view, inputs) if len(faces) else np.zeros(0)
         return faces, pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
-        candidates.add(number, faces, view_utility(p, pixels, areas[faces]), p)
+        candidates.add(number, faces, view_selection.view_utility(p, pixels, areas[faces]), p)
         tell(number + 1, len(views))
     gains, read = np.ones((len(views), 3)), partial(read_color_image, inputs.images)
     if views:
-        colors = sample_face_colors(mesh, candidates, views, read)
-        gains = estimate_gains(candidates.view, colors, len(views))
+        colors = view_selection.sample_face_colors(mesh, candidates, views, read)
+        gains = view_selection.estimate_gains(candidates.view, colors, len(views))
         colors *= gains[candidates.view]  # NaN where there is no view
-        candidates = reject_inconsistent_views(candidates, colors, _MAX_COLOR_DIFFERENCE)
+        candidates = view_selection.reject_inconsistent_views(
+            candidates, colors, _MAX_COLOR_DIFFERENCE
+        )
     return resolve_assignment(mesh, candidates), gains
 
 
@@ -120,7 +108,7 @@ def max_edge_at(views: Sequence[View], points: Float) -> Float:
 
 def resolve_assignment(mesh: Mesh, candidates: Candidates) -> ViewAssignment:
     """Selects the view of each face of a mesh from its candidates, with few seams."""
-    view = select_views(candidates, mesh.adjacent_faces(), SEAM_COST)
+    view = view_selection.select_views(candidates, mesh.adjacent_faces(), SEAM_COST)
     p_static = np.where(candidates.view == view[:, None], candidates.p_static, 0.0).max(axis=1)
     p_static = np.where(view >= 0, p_static, 0.0).astype(np.float32)
     return ViewAssignment(mesh, view, p_static, candidates.visible)
@@ -139,7 +127,7 @@ def p_unoccluded(mesh: Mesh, faces: Index, view: View, inputs: MeshInputs) -> Fl
     ends, p_static = inputs.returns_near(view.stamp_ns)
     # a laser sees past an object what the camera beside it does not see
     informative = (p_static < 0.5) | ~is_in_or_behind_box(there, view.position, ends)
-    mask = build_occlusion_mask(view, ends[informative], p_static[informative])
+    mask = visibility.build_occlusion_mask(view, ends[informative], p_static[informative])
     local = view.to_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the border
@@ -168,7 +156,7 @@ class Background:
     def is_unoccluded(self, number: int, points: Float) -> Bool:
         """(n,) whether no background lies in front of map points (n, 3) in a view."""
         at = self.views[number].to_camera(points)
-        free = at[:, 2] > NEAR
+        free = at[:, 2] > visibility.NEAR
         if not free.any() or not len(self._place.mesh):
             return free
         buffer = self._buffer(number)
@@ -210,13 +198,13 @@ class Background:
         across, down = np.meshgrid(*(np.linspace(0, edge - 1, _BORDER_RAYS) for edge in size))
         shown = unproject(view.camera, np.column_stack([across.ravel(), down.ravel()]))
         shown = shown[np.isfinite(shown).all(axis=1)]
-        scale = min(_BUFFER_WIDTH / view.camera.width, DEPTH_SCALE)
-        return render_depth(self._place.mesh, view, shown, scale)
+        scale = min(_BUFFER_WIDTH / view.camera.width, visibility.DEPTH_SCALE)
+        return visibility.render_depth(self._place.mesh, view, shown, scale)
 
 
 def sample_buffer(values: NDArray[np.generic], buffer: DepthBuffer, at: Float) -> Float:
     """(n,) values of an image (h, w) of a z-buffer at points (n, 3) in the camera's frame."""
     h, w = values.shape
-    column, row = (np.rint(a).astype(np.intp) for a in project_pinhole(buffer.K, at.T))
+    column, row = (np.rint(a).astype(np.intp) for a in visibility.project_pinhole(buffer.K, at.T))
     found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
     return np.asarray(found, np.float64)

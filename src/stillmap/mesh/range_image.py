@@ -18,12 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from stillmap.core.array_types import Bool, Float, Index, Int32
 from stillmap.core.recording import Recording
-from stillmap.mesh.triangulation import (
-    filter_faces,
-    split_rows,
-    triangulate_grid,
-    triangulate_strips,
-)
+from stillmap.mesh import triangulation
 from stillmap.slam.deskew import MAX_SCAN_GAP
 
 _MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole
@@ -209,7 +204,7 @@ def _make_patch(
             row_lengths[key] = find_row_length(directions)
         row_length = row_lengths[key]
     faces = _triangulate_image(points, use, directions, row_length, layout)
-    faces, standoff = filter_faces(points, origin, faces)
+    faces, standoff = triangulation.filter_faces(points, origin, faces)
     used = np.zeros(len(points), np.bool_)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
@@ -228,11 +223,11 @@ def _triangulate_image(
     if median_angle(directions[number[:, -1]], directions[number[:, 0]]) < 2.0 * along:
         number = np.concatenate([number, number[:, :1]], axis=1)
     if layout.is_planar:
-        return triangulate_grid(points, use, number)
+        return triangulation.triangulate_grid(points, use, number)
     around = median_angle(directions[number[-1]], directions[number[0]])
     if len(number) > 2 and around < 2.0 * across:
         number = np.concatenate([number, number[:1]])
-    return triangulate_grid(points, use, number[:: layout.stride, :: layout.stride])
+    return triangulation.triangulate_grid(points, use, number[:: layout.stride, :: layout.stride])
 
 
 def _triangulate_without_grid(use: Bool, directions: Float) -> Int32:
@@ -241,8 +236,10 @@ def _triangulate_without_grid(use: Bool, directions: Float) -> Int32:
     if len(beams) < 3:
         return np.zeros((0, 3), np.int32)
     valid = directions[beams]
-    rows = split_rows(valid)
-    faces = triangulate_directions(valid) if rows is None else triangulate_strips(rows)
+    rows = triangulation.split_rows(valid)
+    faces = (
+        triangulate_directions(valid) if rows is None else triangulation.triangulate_strips(rows)
+    )
     if not len(faces):
         return faces
     chord = np.linalg.norm(valid[faces] - np.roll(valid[faces], 1, axis=1), axis=2).max(axis=1)

@@ -13,18 +13,9 @@ from scipy.spatial import cKDTree
 
 from stillmap.core.array_types import Float, Index
 from stillmap.core.short_repr import ShortRepr
+from stillmap.mesh import partial_scans
 from stillmap.mesh.inputs import MeshInputs, ObjectFrame, TrackedBox
-from stillmap.mesh.partial_scans import (
-    MIN_COMPONENT_AREA,
-    PartialScan,
-    PartialSurface,
-    extract_partial_scan,
-    motion_transform,
-    register_surfaces,
-    surface_distance,
-    triangulate_partial_scan,
-    within_time,
-)
+from stillmap.mesh.partial_scans import PartialScan, PartialSurface
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.returns import HALF_CAR, DynamicReturns, ObjectTrack
 from stillmap.mesh.triangle_mesh import Mesh, subdivide
@@ -93,10 +84,10 @@ def reconstruct_object(
     for duration in durations:
         one, span = _best_track(tracks, images, duration, returns)
         frame = ObjectFrame.from_track(one.box)
-        scan = extract_partial_scan(own, span, frame, fast, returns)
+        scan = partial_scans.extract_partial_scan(own, span, frame, fast, returns)
         if scan is None:
             continue
-        mesh = triangulate_partial_scan(scan, rigid, HALF_CAR)
+        mesh = partial_scans.triangulate_partial_scan(scan, rigid, HALF_CAR)
         if not _is_large_enough(mesh, _MIN_AREA):
             continue
         now = 0.5 * sum(scan.span)
@@ -198,9 +189,12 @@ def _merge_partial_scans(
     if len(surfaces) < 2:
         return None
     best = int(np.argmin([abs(surface.time_offset) for surface in surfaces]))
-    motion = register_surfaces(surfaces, best)
+    motion = partial_scans.register_surfaces(surfaces, best)
     moved = [surface.transform(motion) for surface in surfaces]
-    fits = [surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET for surface in moved]
+    fits = [
+        partial_scans.surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET
+        for surface in moved
+    ]
     kept = [k for k, is_near in enumerate(fits) if is_near or k == best]
     if len(kept) < max(2.0, _MIN_KEPT_SHARE * len(surfaces)):
         return None
@@ -209,7 +203,7 @@ def _merge_partial_scans(
     if not _is_large_enough(mesh, min_area):
         return None
     times = np.array([surfaces[k].time_offset for k in kept])
-    corrections = [motion_transform(motion, at) for at in times.tolist()]
+    corrections = [partial_scans.motion_transform(motion, at) for at in times.tolist()]
     offset = np.array([[*t[:2], np.arctan2(R[1, 0], R[0, 0])] for R, t in corrections])
     span = min(scans[k].span[0] for k in kept), max(scans[k].span[1] for k in kept)
     corrected = ObjectFrame(frame.box, now + times, offset)
@@ -220,21 +214,21 @@ def _partial_scans(
     own: Index, now: float, frame: ObjectFrame, fast: bool, returns: DynamicReturns
 ) -> list[PartialScan]:
     """The partial scans of an object around a time, sorted by time."""
-    near = within_time(own, returns.seconds, now - MERGE_WINDOW, now + MERGE_WINDOW)
+    near = partial_scans.within_time(own, returns.seconds, now - MERGE_WINDOW, now + MERGE_WINDOW)
     scan = returns.inputs.deskewed.scans_of(returns.beam[near])
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
         if len(part):
             seconds = returns.seconds[part]
             span = float(seconds.min()), float(seconds.max())
-            found = extract_partial_scan(own, span, frame, fast, returns)
+            found = partial_scans.extract_partial_scan(own, span, frame, fast, returns)
             out += [found] if found is not None else []
     # scans of several sensors overlap in time
     return sorted(out, key=lambda one: one.span[0] + one.span[1])
 
 
 def _make_surface(scan: PartialScan, now: float) -> PartialSurface:
-    mesh = triangulate_partial_scan(scan, True, _MERGE_DEPTH)
+    mesh = partial_scans.triangulate_partial_scan(scan, True, _MERGE_DEPTH)
     sensor = scan.origin[scan.own].mean(axis=0)
     return PartialSurface.from_mesh(mesh, sensor, 0.5 * sum(scan.span) - now)
 
@@ -247,7 +241,7 @@ def _fuse_patches(patches: Sequence[Patch]) -> Mesh:
         object_voxel_size(patches),
         truncation=_TRUNCATION,
         min_weight=min(_MIN_VIEWS, _MIN_VIEW_SHARE * len(patches)),
-        min_area=MIN_COMPONENT_AREA,
+        min_area=partial_scans.MIN_COMPONENT_AREA,
         max_faces=_MAX_FACES,
     )
 

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, triu
 
 from stillmap.core import arrays
-from stillmap.core.array_types import Bool, Float, Float32, Index, Int32
-from stillmap.core.square_box import component_labels, neighbor_pairs
+from stillmap.core.array_types import Bool, Float, Index, Int32
+from stillmap.core.square_box import component_labels, group_indices, neighbor_pairs
 from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.mapping.labelled_recording import iter_hits
 from stillmap.mesh.inputs import MeshInputs, ObjectFrame, TrackedBox
 from stillmap.tracking import MovingObject
 
@@ -54,7 +55,8 @@ class DynamicReturns(NamedTuple):
         deskewed, objects = inputs.deskewed, inputs.objects
         owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
         whose = np.repeat([one.id for one in objects], [len(one.beams) for one in objects])
-        beam = np.union1d(_dynamic_beams(deskewed.hit, inputs.p_static), owned).astype(np.intp)
+        moving = iter_hits(deskewed.hit, inputs.p_static, dynamic=True)
+        beam = np.unique(np.concatenate([owned, *moving])).astype(np.intp)
         owner = np.full(len(beam), NO_OWNER, np.int32)
         owner[np.searchsorted(beam, owned)] = whose
         dynamic = deskewed.hit[beam] & (inputs.p_static[beam] < DYNAMIC_BELOW)
@@ -76,15 +78,6 @@ class DynamicReturns(NamedTuple):
         """Returns of beams first:last."""
         a, b = np.searchsorted(self.beam, [first, last])
         return slice(int(a), int(b))
-
-
-def _dynamic_beams(hit: Bool, p_static: Float32) -> Index:
-    """Beams that hit something rather dynamic than static, found block by block."""
-    found = [np.zeros(0, np.intp)]
-    for block in arrays.iter_blocks(hit, p_static):
-        dynamic = hit[block] & (p_static[block] < DYNAMIC_BELOW)
-        found.append(block.start + np.flatnonzero(dynamic))
-    return np.concatenate(found)
 
 
 class ObjectTrack(NamedTuple):
@@ -296,8 +289,7 @@ def _is_remnant(seen: Sightings, group: Index, fast: Bool, alike: Index) -> Bool
     """
     beside = {(a, b) for pair in alike.tolist() for a, b in (pair, pair[::-1])}
     less = np.zeros(len(group), np.intp)
-    order = np.argsort(seen.cluster, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(seen.cluster[order])) + 1):
+    for rows in group_indices(seen.cluster):
         objects = seen.object[rows]
         mine = np.bincount(group[objects], seen.beams[rows])[group[objects]]
         for k, beams in zip(objects.tolist(), mine.tolist(), strict=True):

@@ -17,19 +17,10 @@ from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import import_extra
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
+from stillmap.mesh import triangle_mesh
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.range_image import Patch, ScanLayout, find_scan_layout, triangulate_scans
-from stillmap.mesh.triangle_mesh import (
-    Mesh,
-    Tell,
-    concatenate_meshes,
-    no_tell,
-    remove_small_components,
-    simplification_error,
-    simplify,
-    simplify_to_budget,
-    weld,
-)
+from stillmap.mesh.triangle_mesh import Mesh, Tell, no_tell
 from stillmap.mesh.triangulation import range_std
 
 _SAMPLED_PATCHES = 8
@@ -210,15 +201,17 @@ def integrate_patches(
         at = (patch.points, patch.origin, patch.standoff)
         volume.integrate(*at, patch.faces, weight, threads=threads)
         tell(done, 2 * n)
-    error = simplification_error(voxel)
+    error = triangle_mesh.simplification_error(voxel)
     tiles, _ = unique_cells(volume.blocks() // (TILE // volume.block_edge))
     parts = list[Mesh]()
     for done, tile in enumerate(tiles, start=1):
-        parts.append(simplify(extract_tile(volume, tile, min_weight), error))
+        parts.append(triangle_mesh.simplify(extract_tile(volume, tile, min_weight), error))
         tell(n + n * done // len(tiles), 2 * n)
     del volume  # frees the voxels before the mesh grows
-    mesh = remove_small_components(weld(concatenate_meshes(parts)), min_area)
-    return simplify_to_budget(simplify(mesh, error), error, max_faces)
+    mesh = triangle_mesh.remove_small_components(
+        triangle_mesh.weld(triangle_mesh.concatenate_meshes(parts)), min_area
+    )
+    return triangle_mesh.simplify_to_budget(triangle_mesh.simplify(mesh, error), error, max_faces)
 
 
 def static_weights(patch: Patch, p_static: Float32) -> Float32:
@@ -256,7 +249,7 @@ def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Me
     values = np.where(known, metres, np.float32(1.0))
     found, faces, *_ = measure.marching_cubes(values, 0.0, mask=mask, gradient_direction="ascent")
     vertices = found[:, ::-1].astype(np.float64) + first
-    mesh = weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
+    mesh = triangle_mesh.weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
     # vertices are counted from the center of voxel 0
     return Mesh((mesh.vertices + 0.5) * volume.voxel, mesh.faces)
 

@@ -14,6 +14,7 @@ from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
+from stillmap.io.trajectory import bracket_times
 from stillmap.mesh.triangle_mesh import Image, Tell, no_tell
 from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED, MAX_TURN_RATE
 
@@ -158,11 +159,8 @@ def interpolate_poses(stamp_ns: Int64, poses: Float, wanted_ns: Int64) -> tuple[
         n = len(wanted_ns)
         return np.tile(np.eye(4), (n, 1, 1)), [_OUTSIDE] * n
     stamp_ns, first = np.unique(stamp_ns, return_index=True)  # two lasers may share stamps
-    poses, last = poses[first], len(stamp_ns) - 1
-    left = np.clip(np.searchsorted(stamp_ns, wanted_ns, side="right") - 1, 0, max(last - 1, 0))
-    right = np.minimum(left + 1, last)
-    seconds = 1e-9 * (stamp_ns[right] - stamp_ns[left])
-    since = 1e-9 * (wanted_ns - stamp_ns[left])
+    poses = poses[first]
+    left, right, seconds, since = bracket_times(stamp_ns, wanted_ns)
     away = np.minimum(np.abs(since), np.abs(since - seconds))
     outside, near = (since < 0.0) | (since > seconds), away <= _MAX_IMAGE_EXTRAPOLATION
     twist = se3.log(se2.inverse(poses[left]) @ poses[right])

@@ -14,7 +14,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mapping.beam_statistics import sample_points
+from stillmap.mapping.labelled_recording import sample_points
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.snapshots import Snapshot, Window, choose_window, snapshot
 

@@ -14,6 +14,7 @@ from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import GroundMap, estimate_ground
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.mapping.lone_leaves import find_leaf_lines
 from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
@@ -82,37 +83,34 @@ def final_estimate(recording: Recording, best: Estimate, options: Options) -> Fi
     best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
         return FinalEstimate(deskewed, best, [], [])
-    best, movers = _add_motion_evidence(deskewed, best, courses, threads)
+    known = LabelledRecording(deskewed, best.poses, best.p_static, cell, threads)
+    best, movers = _add_motion_evidence(known, best, courses)
+    known = known._replace(p_static=best.p_static)
     changes = mapping.detect_changes(courses, deskewed, cell, look, movers)
     surface = courses.cells[courses.p_in_map("majority") > 0.5]
-    lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
+    lines = find_leaf_lines(known)
     every = mapping.detect_changes(courses, deskewed, cell, look)  # of dynamic hits, too
-    found_doors = mapping.find_doors(every, lines, surface, deskewed, best.poses, cell)
+    found_doors = mapping.find_doors(every, lines, surface, known)
     changes = mapping.join_doors(changes, found_doors)
     swung = [one.door for one in changes if one.door is not None]
-    lone = mapping.find_lone_doors(surface, swung, deskewed, best.poses, cell, threads)
+    lone = mapping.find_lone_doors(surface, swung, known)
     # changed places and doors as the map shows them
-    labels, state = (best.p_static, best.e_step.known_cells), options.output.map_state
-    labels = mapping.relabel_changes(
-        deskewed, best.poses, *labels, courses, changes, state, threads
-    )
-    p_static, occupied = mapping.relabel_lone_doors(
-        deskewed, best.poses, *labels, courses, lone, state, threads
-    )
+    occupied, state = best.e_step.known_cells, options.output.map_state
+    p_static, occupied = mapping.relabel_changes(known, occupied, courses, changes, state)
+    known = known._replace(p_static=p_static)
+    p_static, occupied = mapping.relabel_lone_doors(known, occupied, courses, lone, state)
     learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
     best = best.with_labels(p_static=p_static, occupied=occupied, learned=learned)
     return FinalEstimate(deskewed, best, changes, [*swung, *lone])
 
 
 def _add_motion_evidence(
-    deskewed: Recording, best: Estimate, courses: em.CellHistories, threads: int
+    known: LabelledRecording, best: Estimate, courses: em.CellHistories
 ) -> tuple[Estimate, mapping.MoverPoints]:
     """Labels of beams and cells, given which tracks are movers; the end points on these."""
     noise_std = courses.surfel_map.noise_std
-    p_static, movers = apply_motion_evidence(deskewed, best.poses, best.p_static, noise_std)
-    occupied = mapping.update_occupancy(
-        deskewed, best.poses, best.p_static, p_static, courses, best.e_step.known_cells, threads
-    )
+    p_static, movers = apply_motion_evidence(*known[:3], noise_std)
+    occupied = mapping.update_occupancy(known, p_static, courses, best.e_step.known_cells)
     return best.with_labels(p_static=p_static, occupied=occupied), movers
 
 
@@ -204,8 +202,8 @@ def find_objects(final: FinalEstimate, maps: Maps, options: Options) -> list[Mov
         threads = resolve_threads(options.threads)
         return track_objects_3d(deskewed, poses, p_static, maps.ground, options.objects, threads)
     objects = track_objects(deskewed, poses, p_static, options.objects)
-    cell = maps.filtered.resolution
-    changed = mapping.find_changed_object_beams(deskewed, poses, p_static, changes, doors, cell)
+    known = LabelledRecording(deskewed, poses, p_static, maps.filtered.resolution)
+    changed = mapping.find_changed_object_beams(known, changes, doors)
     moved = [one for one in objects if not _is_change(one, changed, deskewed)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 

@@ -1,7 +1,7 @@
 """The main job and its result: EM to convergence, then all that follows from the best estimate."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping import Change, Door
 from stillmap.pipeline.calibration import correct_recording
 from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
-from stillmap.pipeline.em_loop import EmState, Estimate, IterationRecord, iterate
+from stillmap.pipeline.em_loop import EmState, Estimate, Iteration, IterationRecord, iterate
 from stillmap.pipeline.final_map import FinalEstimate, Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.map_frame import enter_local_frame, leave_local_frame, move_odometry
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
@@ -177,7 +177,8 @@ def map_recording(
     state.single_pass = (
         recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
     )
-    _run_em(recording, state, poses, progress, stages, checkpoint)
+    how: dict[str, Any] = {"poses": poses, "progress": progress, "stages": stages}
+    _run_em(iterate(recording, options, **how, previous=state.latest), state, checkpoint)
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
     recording = move_odometry(recording, odometry)
@@ -191,22 +192,9 @@ def map_recording(
 
 
 def _run_em(
-    recording: Recording,
-    state: EmState,
-    poses: Float | None,
-    progress: Progress,
-    stages: StageTimer,
-    checkpoint: Callable[[EmState], None] | None,
+    steps: Iterator[Iteration], state: EmState, checkpoint: Callable[[EmState], None] | None
 ) -> None:
-    """Iterates until a stopping rule holds; arguments as of `map_recording`."""
-    steps = iterate(
-        recording,
-        state.options,
-        poses=poses,
-        progress=progress,
-        stages=stages,
-        previous=state.latest,
-    )
+    """Iterates until a stopping rule holds."""
     while not state.converged and (iteration := next(steps, None)) is not None:
         state.update(iteration)
         del iteration  # its grid is large

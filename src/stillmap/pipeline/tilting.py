@@ -20,19 +20,13 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import EmOptions, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
-from stillmap.pipeline.tilting_beams import (
-    BoxBeams,
-    PosedRecording,
-    pose_recording,
-    select_box_beams,
-)
+from stillmap.pipeline import tilting_beams
+from stillmap.pipeline.tilting_beams import BoxBeams, PosedRecording
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import HOLD, Box, fit_boxes
-from stillmap.tracking.clustering import MIN_P_DYNAMIC
+from stillmap.tracking.boxes import Box, fit_boxes
 from stillmap.tracking.objects_3d import MIN_POINTS
 
 _VOXEL = 0.1  # m, edge of the voxels of the occupancy evidence
-_MARGIN = 0.15  # m around the box of an object, where points are probably dynamic
 _P_INSIDE, _P_AROUND = 0.99, 0.9  # P(dynamic) of end points in a box and in its margin
 _TOP_PERCENTILE = 98.0  # of an object's end points, which gives its height
 
@@ -120,7 +114,7 @@ def build_tilting(
         threads: the result does not depend on it.
         use_evidence: whether the tilting laser's own occupancy evidence counts.
     """
-    posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
+    posed = tilting_beams.pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
     # from all level surfaces, as nothing is labelled yet
     ground = estimate_ground(posed.deskewed, posed.poses, _constant_labels(posed.deskewed, 1.0))
     learned: dict[str, Any] = {"p_static": em_options.prior}
@@ -131,11 +125,9 @@ def build_tilting(
         poses[:, 2, 3] -= float(np.median(ground.height_at(poses[:, :2, 3]))) + GROUND_CLEARANCE
         evidence = occupancy_hmm.e_step(posed.deskewed, poses, _VOXEL, em_options, threads)
         static, learned = evidence.p_static, evidence.learned
-    boxes = fit_boxes(
-        planar.deskewed, planar.poses, planar.p_static, planar.objects, MIN_P_DYNAMIC, HOLD
-    )
+    boxes = fit_boxes(planar.deskewed, planar.poses, planar.p_static, planar.objects)
     start_ns = int(planar.deskewed.stamp_ns[0])
-    in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns, _MARGIN)
+    in_boxes = tilting_beams.select_box_beams(boxes, recording, posed, ground, start_ns)
     p_static = apply_boxes(static, in_boxes, learned["p_static"], recording.scratch)
     return TiltingResult(
         recording,

@@ -12,10 +12,11 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em import GroundMap
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
-from stillmap.io.trajectory import embed_in_3d
+from stillmap.io.trajectory import bracket_times, embed_in_3d
 from stillmap.slam.deskew import MAX_SCAN_GAP, MAX_SPEED
 from stillmap.tracking.boxes import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH, Box
 
+_MARGIN = 0.15  # m around the box of an object, where points are probably dynamic
 _MAX_VEHICLE_HEIGHT = 4.0  # m above the ground
 _MAX_VERTICAL_GAP = 0.5  # m without any point, above which points belong to something else
 _MIN_HEIGHT = 1.0  # m; the planar laser lies lower, so points below in a box are of the object
@@ -49,11 +50,7 @@ def interpolate_poses(stamp_ns: Int64, poses: Float, at_ns: Int64) -> tuple[Floa
         (N, 3, 3) poses, outside the scans' time the first or the last one; (N,) whether they are
         known.
     """
-    last = max(len(poses) - 2, 0)
-    before = np.clip(np.searchsorted(stamp_ns, at_ns, side="right") - 1, 0, last)
-    after = np.minimum(before + 1, len(poses) - 1)
-    seconds = 1e-9 * (stamp_ns[after] - stamp_ns[before])
-    since = 1e-9 * (at_ns - stamp_ns[before])
+    before, after, seconds, since = bracket_times(stamp_ns, at_ns)
     share = np.clip(since / np.where(seconds > 0.0, seconds, np.inf), 0.0, 1.0)
     twist = se2.log(se2.inverse(poses[before]) @ poses[after])
     known = (at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])
@@ -119,7 +116,6 @@ def select_box_beams(
     posed: PosedRecording,
     ground: GroundMap,
     start_ns: int,
-    margin: float,
 ) -> list[BoxBeams]:
     """The beams that ended in each box or in its margin, from the ground to the object's top.
 
@@ -129,7 +125,6 @@ def select_box_beams(
         posed: the same at its poses.
         ground: height of the ground.
         start_ns: a stamp.
-        margin: m around each box.
     """
     ends = _end_points(posed)
     seconds = 1e-9 * (recording.stamp_ns - start_ns)
@@ -141,9 +136,9 @@ def select_box_beams(
         beams = slice(int(recording.offset[first]), int(recording.offset[stop]))
         stamps = beam_stamps_ns(recording, slice(first, stop))
         at = np.asarray(1e-9 * (stamps - start_ns), np.float64)
-        near = np.flatnonzero(_is_near_path(box, ends[beams], margin))
+        near = np.flatnonzero(_is_near_path(box, ends[beams]))
         xyz = np.asarray(ends[beams][near], np.float64)
-        within = box.contains(at[near], xyz[:, :2], margin)
+        within = box.contains(at[near], xyz[:, :2], _MARGIN)
         near, xyz = near[within], xyz[within]
         core = box.contains(at[near], xyz[:, :2], 0.0)
         height = xyz[:, 2] - ground.height_at(xyz[:, :2])
@@ -179,9 +174,9 @@ def _end_points(posed: PosedRecording) -> Float32:
     return ends
 
 
-def _is_near_path(box: Box, ends: Float32, margin: float) -> Bool:
+def _is_near_path(box: Box, ends: Float32) -> Bool:
     """(n,) whether end points lie near the path of a box at any time; a cheap first test."""
     beyond = box.hold * float(np.linalg.norm(box.velocity[[0, -1]], axis=1).max())
-    radius = float(np.linalg.norm(box.half_size)) + 2.0 * margin + beyond
+    radius = float(np.linalg.norm(box.half_size)) + 2.0 * _MARGIN + beyond
     low, high = box.xy.min(axis=0) - radius, box.xy.max(axis=0) + radius
     return np.asarray(((ends[:, :2] >= low) & (ends[:, :2] <= high)).all(axis=1))

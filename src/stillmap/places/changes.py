@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.short_repr import ShortRepr
-from stillmap.core.square_box import connected_components, neighbor_pairs
+from stillmap.mapping.change_detection import Events, group_events
 from stillmap.places.place_states import PlaceStates, are_near
 from stillmap.results.timeline import Kind
 
@@ -36,7 +37,7 @@ def fit_leaf(points: Float) -> Leaf | None:
     """The straight leaf through points (n, 2) in metres; None: they are none."""
     offset = points - points.mean(axis=0)
     axis = np.linalg.eigh(offset.T @ offset)[1][:, 1]
-    along, across = offset @ axis, offset @ [-axis[1], axis[0]]
+    along, across = se2.along_and_across(offset, axis)
     length = float(np.ptp(along))
     if not _LENGTH[0] <= length <= _LENGTH[1] or float(np.abs(across).max()) > _THICKNESS:
         return None
@@ -80,8 +81,7 @@ def is_hinged(leaf: Leaf, wall: Float) -> bool:
 def _is_gap(end: Float, angle: float, length: float, wall: Float) -> bool:
     """True if a wall ends near a point and goes on in a direction, a leaf's width away."""
     u = np.array([np.cos(angle), np.sin(angle)])
-    offset = wall - end
-    along, across = offset @ u, offset @ [-u[1], u[0]]
+    along, across = se2.along_and_across(wall - end, u)
     along = along[np.abs(across) <= _THICKNESS]
     behind, ahead = along[along < length / 2.0], along[along >= length / 2.0]
     if not len(behind) or not len(ahead):
@@ -137,18 +137,6 @@ _CLEAR, _SHARE = 2.0, 0.7  # nats of a clear observation; share of them that a c
 _WALL_MARGIN = 2.0  # m around a leaf in which its gap is looked for
 
 
-class _Events(NamedTuple):
-    """N changes of single cells: the cell, came or left, last session before and first after."""
-
-    cell: Index
-    came: Bool
-    before: Index
-    after: Index
-
-    def select(self, chosen: Index) -> "_Events":
-        return _Events._make(column[chosen] for column in self)
-
-
 def detect_place_changes(place: PlaceStates) -> tuple[PlaceStates, list[PlaceChange]]:
     """The changes between sessions, in the order of time.
 
@@ -165,14 +153,15 @@ def detect_place_changes(place: PlaceStates) -> tuple[PlaceStates, list[PlaceCha
     return place, out
 
 
-def _find_groups(place: PlaceStates) -> list[_Events]:
+def _find_groups(place: PlaceStates) -> list[Events]:
     """Events of cells, grouped to objects that came or left between two sessions."""
     events, min_cells = _find_events(place), _MIN_CELLS[place.cells.shape[1]]
     static = place.cells[place.states.p_static > _MIN_PROBABILITY]
     near = are_near(place.cells[events.cell], static, _NOISE)
     apart, beside = (events.select(np.flatnonzero(mask)) for mask in (~near, near))
     out = []
-    for group in _group_events(apart, place):
+    radius = _LINK_DISTANCE / place.resolution
+    for group in group_events(apart, place.cells, radius):
         out += _split_by_time(group, min_cells)
     out = [_attach(group, beside, place) for group in out]
     return [
@@ -180,7 +169,7 @@ def _find_groups(place: PlaceStates) -> list[_Events]:
     ]
 
 
-def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
+def _attach(group: Events, beside: Events, place: PlaceStates) -> Events:
     """A group with the like events right beside it that are also near static surface.
 
     Of those that fit its span of time, the ones that share a part of it with most others.
@@ -191,12 +180,12 @@ def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
     at = at[are_near(place.cells[beside.cell[at]], place.cells[group.cell], _BESIDE)]
     first, last = beside.before[at], beside.after[at]
     at = max((at[(first <= s) & (last > s)] for s in range(before, after)), key=len)
-    return _Events._make(
+    return Events._make(
         np.concatenate([own, further[at]]) for own, further in zip(group, beside, strict=True)
     )
 
 
-def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
+def _share_evidence(place: PlaceStates, groups: list[Events]) -> PlaceStates:
     """The place with the evidence of each group in cells beside it that were not seen as clearly.
 
     Those that stood when the object did, of which a session did not see that they are otherwise.
@@ -223,7 +212,7 @@ def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
     return place.with_evidence(evidence, changed)
 
 
-def _find_events(place: PlaceStates) -> _Events:
+def _find_events(place: PlaceStates) -> Events:
     """The changes of all cells that are more probably changing than not."""
     states = place.states
     changed = np.flatnonzero(states.p_changing > _MIN_PROBABILITY)
@@ -238,20 +227,10 @@ def _find_events(place: PlaceStates) -> _Events:
         columns.append((changed[k], path[k, s], last[k], np.full(len(k), s)))
         last = np.where(observed[:, s], s, last)
     cell, came, before, after = (np.concatenate(column) for column in zip(*columns, strict=True))
-    return _Events(cell.astype(np.intp), came.astype(np.bool_), before, after)
+    return Events(cell.astype(np.intp), came.astype(np.bool_), before, after)
 
 
-def _group_events(events: _Events, place: PlaceStates) -> list[_Events]:
-    """Connected events of one kind whose time spans overlap."""
-    pairs = neighbor_pairs(place.cells[events.cell], _LINK_DISTANCE / place.resolution)
-    i, j = pairs.T
-    begin = np.maximum(events.before[i], events.before[j])
-    end = np.minimum(events.after[i], events.after[j])
-    fits = (events.came[i] == events.came[j]) & (begin < end)
-    return [events.select(group) for group in connected_components(pairs[fits], len(events.cell))]
-
-
-def _split_by_time(events: _Events, min_cells: int) -> list[_Events]:
+def _split_by_time(events: Events, min_cells: int) -> list[Events]:
     """Groups of events that share a span of time: each the span that fits most cells left."""
     out = []
     while len(events.cell) >= min_cells:
@@ -266,18 +245,12 @@ def _split_by_time(events: _Events, min_cells: int) -> list[_Events]:
     return out
 
 
-def _make_change(events: _Events, place: PlaceStates) -> PlaceChange:
+def _make_change(events: Events, place: PlaceStates) -> PlaceChange:
     cells = np.unique(events.cell)
-    low, high = _box(place, cells)
-    return PlaceChange(
-        "appeared" if events.came[0] else "gone",
-        low,
-        high,
-        int(events.before.max()),
-        int(events.after.min()),
-        float(place.states.p_changing[cells].mean()),
-        cells,
-    )
+    kind: Kind = "appeared" if events.came[0] else "gone"
+    between = int(events.before.max()), int(events.after.min())
+    probability = float(place.states.p_changing[cells].mean())
+    return PlaceChange(kind, *_box(place, cells), *between, probability, cells)
 
 
 def _box(place: PlaceStates, cells: Index) -> tuple[Float, Float]:

@@ -19,6 +19,7 @@ from stillmap.core import arrays, se2
 from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import cell_keys as cell_keys
 from stillmap.places.keyframes import Keyframes
 from stillmap.slam import PoseGraph
 
@@ -93,15 +94,6 @@ def _iter_end_cells(
         beams = block.start + np.flatnonzero(recording.hit[block])
         ends = recording.end_points(beams, poses)
         yield beams, np.floor(ends / resolution).astype(np.int32)
-
-
-def cell_keys(cells: NDArray[np.integer]) -> Int64:
-    """(N,) keys of cells (N, D), which sort as the cells do, column by column."""
-    bits = 63 // cells.shape[1]
-    key = np.zeros(len(cells), np.int64)
-    for column in cells.T:
-        key = (key << bits) + (column.astype(np.int64) + (1 << (bits - 1)))
-    return key
 
 
 def look_up(

@@ -19,7 +19,7 @@ from stillmap.core.local_frame import Fields, Shift, shift, shift_poses
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.io.trajectory import MAX_BYTES, write_tum
-from stillmap.mapping.beam_statistics import count_beams
+from stillmap.mapping.labelled_recording import count_beams
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import rate_geometry
@@ -34,6 +34,8 @@ from stillmap.results.report.place import render_place_report
 from stillmap.results.timeline import CHANGES, STATES, PlaceSession
 from stillmap.slam import PoseGraph
 
+# of `sessions.json`, what is known of a session that is not in the place
+_REFUSAL = ("name", "input", "accepted", "why")
 LAST, MAJORITY = "last", "majority"
 _STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
 _DAY_NS = 86_400 * 10**9
@@ -283,12 +285,7 @@ def _join_graphs(place: Place) -> PoseGraph:
 def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     """The entries of `sessions.json`, in the order in which the inputs were given."""
     records: dict[str, dict[str, Any]] = {
-        refused.name: {
-            "name": refused.name,
-            "input": refused.input,
-            "accepted": False,
-            "why": refused.why,
-        }
+        refused.name: {name: getattr(refused, name) for name in _REFUSAL}
         for refused in result.refusals
     }
     first_scan, by = 0, _to_map_frame(result.place)

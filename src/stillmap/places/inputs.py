@@ -55,6 +55,27 @@ class SessionInput(ShortRepr):
         return None if isinstance(self.given, Recording) else str(self.given[0])
 
 
+@dataclass(frozen=True, eq=False)
+class MergeJob(ShortRepr):
+    """Sessions to be merged, and the settings.
+
+    Attributes:
+        base: folder of a place to which sessions are added; None: a new place.
+        sessions: to be merged, in the order in which they were given.
+        options: of mapping, and of the map.
+        frame: name of the session whose frame the place has; None: the first one, or as it was.
+        map_state: "last", "majority", the name of a session, or a date (ISO 8601).
+        odometry: whether odometry in recordings is used.
+    """
+
+    base: Path | None
+    sessions: list[SessionInput]
+    options: Options
+    frame: str | None = None
+    map_state: str = "last"
+    odometry: bool = True
+
+
 def list_sessions(groups: Sequence[Given], taken: Sequence[str] = ()) -> list[SessionInput]:
     """The sessions of inputs, each a group of paths that belong together.
 
@@ -123,19 +144,11 @@ def _unique(stem: str, names: set[str]) -> str:
     return next(name for k in range(2, len(names) + 3) if (name := f"{stem}-{k}") not in names)
 
 
-def prepare_sessions(
-    inputs: Sequence[SessionInput],
-    options: Options,
-    odometry: bool,
-    folder: Path,
-    progress: Progress,
-) -> list[Session]:
+def prepare_sessions(job: MergeJob, folder: Path, progress: Progress) -> list[Session]:
     """The sessions, each mapped where it was not, with what the place keeps of it written.
 
     Args:
-        inputs: to be merged.
-        options: of mapping, and of the map.
-        odometry: whether odometry in recordings is used.
+        job: what is to be merged.
         folder: of the place; `sessions/NAME` are made.
         progress: as of `merge_sessions`.
 
@@ -143,23 +156,23 @@ def prepare_sessions(
         InputError: an input cannot be read or mapped.
     """
     out = []
-    for number, session in enumerate(inputs, start=1):
+    for number, session in enumerate(job.sessions, start=1):
         report = prefix_steps(progress, f"session {number}")
-        out.append(_prepare_session(session, options, odometry, folder, report))
+        out.append(_prepare_session(session, job, folder, report))
     return out
 
 
 def _prepare_session(
-    session: SessionInput, options: Options, odometry: bool, folder: Path, report: Progress
+    session: SessionInput, job: MergeJob, folder: Path, report: Progress
 ) -> Session:
-    given = session.given
+    given, options = session.given, job.options
     if isinstance(given, tuple) and _is_one_result(given):
         given = load(given[0])
     if isinstance(given, Result) and given.path is not None:
         return keep_session(session, given, given.deskewed, folder, options)
     with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
         if not isinstance(given, Result):
-            given = build(given, options, odometry=odometry, progress=report, scratch=scratch)
+            given = build(given, options, odometry=job.odometry, progress=report, scratch=scratch)
         mapped, recording = Path(scratch) / "result", given.recording
         given.save(mapped)
         del given

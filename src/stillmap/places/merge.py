@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,11 +18,10 @@ from stillmap.core.files import atomic_folder, remove
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress, prefix_steps
 from stillmap.core.recording import Recording
-from stillmap.core.short_repr import ShortRepr
 from stillmap.pipeline.options import Options, adopt_cells
 from stillmap.places.finish import PlaceResult, finish_place, require_map_state, write_place
 from stillmap.places.grow import add_session, start_place
-from stillmap.places.inputs import SessionInput, cell_size, list_sessions, prepare_sessions
+from stillmap.places.inputs import MergeJob, cell_size, list_sessions, prepare_sessions
 from stillmap.places.keyframes import Session
 from stillmap.places.place import Place, update_evidence
 from stillmap.places.store import copy_session, read_place
@@ -32,27 +31,6 @@ from stillmap.results.timeline import PlaceSession, read_sessions
 
 Paths: TypeAlias = Sequence[str | os.PathLike[str]]
 SessionLike: TypeAlias = str | os.PathLike[str] | Paths | Recording | Result
-
-
-@dataclass(frozen=True, eq=False)
-class MergeJob(ShortRepr):
-    """Sessions to be merged, and the settings.
-
-    Attributes:
-        base: folder of a place to which sessions are added; None: a new place.
-        sessions: to be merged, in the order in which they were given.
-        options: of mapping, and of the map.
-        frame: name of the session whose frame the place has; None: the first one, or as it was.
-        map_state: "last", "majority", the name of a session, or a date (ISO 8601).
-        odometry: whether odometry in recordings is used.
-    """
-
-    base: Path | None
-    sessions: list[SessionInput]
-    options: Options
-    frame: str | None = None
-    map_state: str = "last"
-    odometry: bool = True
 
 
 @limit_blas_threads()
@@ -86,7 +64,7 @@ def merge_sessions(
             options = adopt_cells(job.options, "place", edges)
             job = replace(job, frame=job.frame or place.frame, options=options)
         _check_job(job, [*order, *(session.name for session in job.sessions)])
-        sessions = prepare_sessions(job.sessions, job.options, job.odometry, folder, progress)
+        sessions = prepare_sessions(job, folder, progress)
         order += [session.name for session in sessions]
         place, refused = _grow(place, sessions, job, threads, progress)
         refusals += refused

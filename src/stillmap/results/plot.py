@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from stillmap.core.array_types import Float
 from stillmap.core.errors import import_extra
-from stillmap.mapping.beam_statistics import sample_points
+from stillmap.mapping.labelled_recording import sample_points
 from stillmap.results.colors import KIND_COLORS
 from stillmap.results.mapped_place import MappedPlace
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window

@@ -15,7 +15,7 @@ from stillmap.core.json import to_jsonable
 from stillmap.core.recording import Recording
 from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change, Door
-from stillmap.mapping.beam_statistics import count_beams
+from stillmap.mapping.labelled_recording import count_beams
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.tilting import TiltingResult

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.sim import laser, ray_casting
 from stillmap.sim.dynamics import Moment
@@ -167,10 +166,3 @@ def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Flo
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
     rays = transform_rays(pattern, T_base_sensor[None])
     return ray_casting.intersect_solid(rays.origin, rays.direction, body, 0, body.pose[:, 0])
-
-
-def lift_poses(poses: Float) -> Float:
-    """(T, 4, 4) of planar poses (T, 3, 3)."""
-    x, y, yaw = se2.parameters(poses).T
-    still = np.zeros_like(x)
-    return make_pose(np.stack([x, y, still], axis=-1), still, still, yaw)

@@ -15,6 +15,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes
 from stillmap.io import stillmap_folder
 from stillmap.io.registry import RIG_FOLDERS
+from stillmap.io.trajectory import embed_in_3d
 from stillmap.sim import lidar, truth
 from stillmap.sim.camera import CameraSimulator, Color
 from stillmap.sim.dynamics import Progress
@@ -151,7 +152,7 @@ def _record(
         T_base_sensor = sensor.T_base_sensor[np.ix_([0, 1, 3], [0, 1, 3])]
     else:
         T_world_base = make_pose(world.robot[:, :3], *world.robot[:, 3:].T)
-        T_base_sensor, T_odom_base = sensor.T_base_sensor, lidar.lift_poses(episode.T_odom_base)
+        T_base_sensor, T_odom_base = sensor.T_base_sensor, embed_in_3d(episode.T_odom_base)
     recording = Recording(
         stamp_ns=episode.stamp_ns,
         offset=np.array(offset, np.int64),

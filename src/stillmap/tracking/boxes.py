@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stillmap.core import se2
 from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.recording import Recording
 from stillmap.tracking import MovingObject
-from stillmap.tracking.clustering import extract_dynamic_points
+from stillmap.tracking.clustering import MIN_P_DYNAMIC, extract_dynamic_points
 from stillmap.tracking.objects import HEADING_SPEED
 
 HOLD = 0.5  # s for which an object persists before its first and after its last detection
@@ -56,37 +57,29 @@ class Box:
         """(n,) whether positions (n, 2) at times (n,) lie within `margin` metres of the box."""
         early, late = self._outside(seconds)
         at = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)
-        heading, offset = self.heading[at], xy - self.center_at(seconds)
-        along = np.abs((offset * heading).sum(axis=1))
-        across = np.abs(offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1])
-        near = (along <= self.half_size[0] + margin) & (across <= self.half_size[1] + margin)
+        along, across = se2.along_and_across(xy - self.center_at(seconds), self.heading[at])
+        near = np.abs(along) <= self.half_size[0] + margin
+        near &= np.abs(across) <= self.half_size[1] + margin
         return np.asarray(near & (late - early <= self.hold))
 
 
 def fit_boxes(
-    recording: Recording,
-    poses: Float,
-    p_static: Float32,
-    objects: Sequence[MovingObject],
-    min_p_dynamic: float,
-    hold: float,
+    recording: Recording, poses: Float, p_static: Float32, objects: Sequence[MovingObject]
 ) -> list[Box]:
-    """Boxes around all beams whose P(dynamic) is at least `min_p_dynamic`.
+    """Boxes around all beams that may belong to a moving object, which persists for `HOLD`.
 
     Args:
         recording: 2D, M beams, deskewed.
         poses: (T, 3, 3) T_map_base.
         p_static: (M,) P(c = 1) of every beam.
         objects: the moving objects.
-        min_p_dynamic: threshold of 1 - p_static.
-        hold: s for which an object persists before its first and after its last detection.
     """
     start = int(recording.stamp_ns[0])
-    points = extract_dynamic_points(recording, poses, p_static, min_p_dynamic)
+    points = extract_dynamic_points(recording, poses, p_static, MIN_P_DYNAMIC)
     owned = np.concatenate([np.zeros(0, np.intp), *(mover.beams for mover in objects)])
     rest = ~np.isin(points.beam, owned)
     xy, scan = points.xy[rest], points.scan[rest]
-    out = [fit_box(mover, start, hold) for mover in objects]
+    out = [fit_box(mover, start) for mover in objects]
     _, first, count = np.unique(points.cluster[rest], return_index=True, return_counts=True)
     for a, n in zip(first.tolist(), count.tolist(), strict=True):
         if n >= _MIN_POINTS:
@@ -95,13 +88,12 @@ def fit_boxes(
     return out
 
 
-def fit_box(mover: MovingObject, start: int, hold: float) -> Box:
+def fit_box(mover: MovingObject, start: int) -> Box:
     """The box of an object.
 
     Args:
         mover: the object.
         start: ns, time 0 of the box.
-        hold: s for which it persists before its first and after its last detection.
     """
     seconds = np.asarray(1e-9 * (mover.stamp_ns - start), np.float64)
     speed = np.linalg.norm(mover.velocity, axis=1)
@@ -112,7 +104,7 @@ def fit_box(mover: MovingObject, start: int, hold: float) -> Box:
         heading = mover.velocity[at] / speed[at, None]
     else:  # its heading is unknown
         heading, half = np.tile([1.0, 0.0], (len(seconds), 1)), (max(half), max(half))
-    return Box(mover.id, seconds, mover.xy, heading, mover.velocity, half, hold)
+    return Box(mover.id, seconds, mover.xy, heading, mover.velocity, half, HOLD)
 
 
 def _fit_static_box(xy: Float, seconds: Float) -> Box:

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Float32, Index, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import cell_keys
 from stillmap.em.mixture import log_beta
+from stillmap.mapping.labelled_recording import LabelledRecording
 from stillmap.tracking.association import ACCELERATION
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
@@ -50,7 +50,7 @@ def compute_probability(log_odds: Float) -> Float:
 
 
 _MARGIN, _MARGIN_OF_WALKERS = 0.15, 0.1  # m around the box, the circle: chairs are near walkers
-_CELL = 0.25  # m, of a place
+PLACE = 0.25  # m, of a place
 _STRAY = 19.0  # Beta(1, 19): share of the hits outside, of places that only movers were in
 
 
@@ -68,9 +68,7 @@ class MoverHits(NamedTuple):
     p_mover: Float
 
 
-def explain_hits(
-    recording: Recording, poses: Float, p_static: Float32, on_movers: MoverHits, is_vehicle: Bool
-) -> Float32:
+def explain_hits(known: LabelledRecording, on_movers: MoverHits, is_vehicle: Bool) -> Float32:
     """(M,) P(static), lower for beams that ended on movers.
 
     Of the m + n hits of a place, m are explained by movers and n not. Where something static
@@ -79,26 +77,23 @@ def explain_hits(
     keep to chairs and walls, either is as probable before any hit.
 
     Args:
-        recording: 2D, M beams.
-        poses: (T, 3, 3) T_map_base.
-        p_static: (M,) P(c = 1).
+        known: 2D, M beams, with places as cells.
         on_movers: from `find_mover_hits`.
         is_vehicle: (K,) the paths of vehicles.
     """
     beam, path, weight = on_movers
     if not len(beam):
-        return p_static
-    key = cell_keys(np.floor(recording.end_points(beam, poses) / _CELL).astype(np.int64))
-    places, place = np.unique(key, return_inverse=True)
+        return known.p_static
+    places, place = np.unique(cell_keys(known.end_cells(beam)), return_inverse=True)
     explained = np.bincount(place, weight, minlength=len(places)).astype(np.float64)
-    others = _static_hits(recording, poses, p_static, places)
-    others -= np.bincount(place, np.nan_to_num(p_static[beam]), minlength=len(places))
+    others = _static_hits(known, places)
+    others -= np.bincount(place, np.nan_to_num(known.p_static[beam]), minlength=len(places))
     log_ratio = compute_log_ratio(explained, np.maximum(others, 0.0))
     on_vehicle = is_vehicle[path]
     by_vehicles = np.bincount(place, weight * on_vehicle, minlength=len(places)).astype(np.float64)
     of_vehicles, of_walkers = fit_share(log_ratio, by_vehicles), compute_probability(log_ratio)
     p_place = np.where(on_vehicle, of_vehicles[place], of_walkers[place])
-    out = arrays.copy(p_static, recording.scratch)
+    out = known.copy_labels()
     out[beam] *= (1.0 - weight * (1.0 - p_place)).astype(np.float32)
     return out
 
@@ -165,15 +160,15 @@ def find_mover_hits(
     return MoverHits(*(np.concatenate(column) for column in zip(*hits, strict=True)))
 
 
-def _static_hits(recording: Recording, poses: Float, p_static: Float32, places: Int64) -> Float:
+def _static_hits(known: LabelledRecording, places: Int64) -> Float:
     """(P,) expected number of static hits in each place."""
     out = np.zeros(len(places))
-    for block in arrays.iter_blocks(recording.hit, p_static):
-        beam = block.start + np.flatnonzero(recording.hit[block] & ~np.isnan(p_static[block]))
-        key = cell_keys(np.floor(recording.end_points(beam, poses) / _CELL).astype(np.int64))
+    for hits in known.iter_hits():
+        beam = hits[~np.isnan(known.p_static[hits])]
+        key = cell_keys(known.end_cells(beam))
         at = np.minimum(np.searchsorted(places, key), len(places) - 1)
         is_at = places[at] == key
-        out += np.bincount(at[is_at], p_static[beam[is_at]], minlength=len(places))
+        out += np.bincount(at[is_at], known.p_static[beam[is_at]], minlength=len(places))
     return out
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core import arrays
+from stillmap.core import arrays, se2
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.detections import count_tracks
@@ -115,10 +115,9 @@ def _select_clusters(points: DynamicPoints, owner: Index, lasting: Bool) -> _Clu
     wide = np.linalg.norm(points.xy[ends - 1] - points.xy[begins], axis=1) > _WIDE
     chosen = wide | ~lasting[owner[begins]]
     begins, size = begins[chosen], (ends - begins)[chosen]
-    own = np.repeat(begins - np.cumsum(size) + size, size) + np.arange(size.sum())
+    of, own = arrays.expand_ranges(begins, size)
     xy, first = points.xy[own], np.cumsum(size) - size
     edge = np.empty((len(begins), _DIRECTIONS, 2))
-    of = np.repeat(np.arange(len(begins)), size)
     for k, u in enumerate(_unit_vectors() if len(begins) else ()):
         order = np.lexsort((xy @ u, of))  # the last one of each cluster lies farthest
         edge[:, k] = xy[order[first + size - 1]]
@@ -183,9 +182,7 @@ def _later_range(clusters: _Clusters, of: Index) -> tuple[Index, Index]:
 def _pairs_of(clusters: _Clusters, of: Index) -> tuple[Index, Index]:
     """Which of `of` (n,), and each of its later detections."""
     low, high = _later_range(clusters, of)
-    count = high - low
-    which = np.repeat(np.arange(len(of)), count)
-    return which, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
+    return arrays.expand_ranges(low, high - low)
 
 
 def _pair(clusters: _Clusters, of: Index) -> _Seeds:
@@ -218,10 +215,9 @@ def _extend(clusters: _Clusters, seeds: _Seeds) -> _Seeds:
     dt = clusters.seconds[later] - t[which, -1]
     xy = clusters.edge[later, seeds.side[which]]
     off = xy - seeds.xy[which, -1] - dt[:, None] * velocity[which]
-    along = (off * u[which]).sum(axis=1) / _GATE_ALONG
+    along, across = se2.along_and_across(off, u[which])
     gate = _GATE_ACROSS + _ACROSS_PER_METRE * clusters.range[later]
-    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / gate
-    cost = along**2 + across**2
+    cost = (along / _GATE_ALONG) ** 2 + (across / gate) ** 2
     near = np.flatnonzero(cost < 1.0)
     order = near[np.lexsort((cost[near], which[near]))]
     best = order[np.flatnonzero(np.diff(which[order], prepend=-1))]

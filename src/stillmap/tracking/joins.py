@@ -13,6 +13,7 @@ import numpy as np
 
 from stillmap.core import kalman
 from stillmap.core.array_types import Bool, Float, Index
+from stillmap.core.arrays import expand_ranges
 from stillmap.core.kalman import TrackStates
 
 _MIN_P = (0.97, 0.95, 0.9, 0.8, 0.6, 0.4, 0.05)  # of joins, round by round
@@ -184,9 +185,8 @@ def _find_candidates(ends: _Ends) -> tuple[Index, Index, Float]:
         k = np.arange(some, min(some + _MAX_ENDS, len(order)))
         low = np.searchsorted(begins, ends.last[k], side="right")
         count = np.searchsorted(begins, ends.last[k] + _MAX_GAP, side="right") - low
-        before = np.repeat(k, count)
-        at = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
-        after = order[at]
+        of, at = expand_ranges(low, count)
+        before, after = k[of], order[at]
         gap = ends.first[after] - ends.last[before]
         step = np.linalg.norm(ends.at_first.x[after] - ends.at_last.x[before], axis=1)
         speed = np.where(ends.speed_std[before] > _SPEED_STD, 3.0 * _FAST_SPEED_STD, _MAX_SPEED)

@@ -23,15 +23,11 @@ from stillmap.core.square_box import group_indices
 from stillmap.em.mixture import log_beta
 from stillmap.em.shape_evidence import find_lost_beams
 from stillmap.mapping import MoverPoints
+from stillmap.mapping.labelled_recording import LabelledRecording
+from stillmap.tracking import explained_hits
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
 from stillmap.tracking.detections import compute_centroids, count_steady_windows, iterate_tracks
-from stillmap.tracking.explained_hits import (
-    explain_hits,
-    find_mover_hits,
-    fit_share,
-    iterate_walker_paths,
-)
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.tracklets import join_tracklets
@@ -116,13 +112,14 @@ def apply_motion_evidence(
         out[beam] = 1.0 - (1.0 - out[beam]) * p
         xy, stamp_ns = points.xy[block], recording.stamp_ns[points.scan[block]]
         movers.append(MoverPoints(xy[p > 0.5], stamp_ns[p > 0.5]).thin())
-    walkers = dict(iterate_walker_paths(points, owner, p_mover, {*fast, *sliding}))
+    walkers = dict(explained_hits.iterate_walker_paths(points, owner, p_mover, {*fast, *sliding}))
     tracks = np.array([*fast, *walkers], np.intp)
     of_path = np.where(tracks >= 0, p_mover[tracks], 0.0)
     followed = [*paths, *walkers.values()]
-    on_movers = find_mover_hits(recording, poses, points.seconds, followed, of_path)
+    on_movers = explained_hits.find_mover_hits(recording, poses, points.seconds, followed, of_path)
     is_vehicle = np.arange(len(followed)) < len(paths)
-    out = explain_hits(recording, poses, out, on_movers, is_vehicle)
+    known = LabelledRecording(recording, poses, out, explained_hits.PLACE)
+    out = explained_hits.explain_hits(known, on_movers, is_vehicle)
     return out, MoverPoints.concatenate(movers)
 
 
@@ -151,7 +148,7 @@ def weigh_tracks(
         evidence.moving[k] = max(evidence.moving[k], moving)
         evidence.slides[k] = 0.0  # the side of a car is as straight
     out = np.zeros(int(tracks.max()) + 1)
-    out[tracks] = fit_share(compute_log_ratio(evidence), evidence.detections)
+    out[tracks] = explained_hits.fit_share(compute_log_ratio(evidence), evidence.detections)
     return out, tracks[evidence.slides > 0.0].tolist()
 
 

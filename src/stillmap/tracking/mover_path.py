@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core import kalman
+from stillmap.core import kalman, se2
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.tracking.clustering import DynamicPoints
 
@@ -115,8 +115,7 @@ def _within_box(
 ) -> tuple[Index, Float, Float]:
     """Points within the object as it is expected, and their offsets along and across."""
     here = np.arange(points.first[scan], points.first[scan + 1])
-    off = points.xy[here] - state.x[0]
-    along, across = off @ u, off[:, 1] * u[0] - off[:, 0] * u[1]
+    along, across = se2.along_and_across(points.xy[here] - state.x[0], u)
     gate = _gate(state)
     behind = along * (-1.0 if leads else 1.0)  # m into the object from the edge
     inside = (behind >= -gate) & (behind <= _LENGTH) & (np.abs(across) <= _HALF_WIDTH + gate)
@@ -255,8 +254,7 @@ class MoverPath:
         """(n,) whether points (n, 2) at times (n,) lie within the box and `margin` metres."""
         x, v = self.state_at(seconds)
         u = v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
-        off = xy - x
-        along, across = (off * u).sum(axis=1), off[:, 1] * u[:, 0] - off[:, 0] * u[:, 1]
+        along, across = se2.along_and_across(xy - x, u)
         near = (seconds >= self.seconds[0] - _REACH) & (seconds <= self.seconds[-1] + _REACH)
         near &= np.abs(along) <= 0.5 * self.length + margin
         return np.asarray(near & (np.abs(across) <= 0.5 * self.width + margin))

@@ -3,11 +3,11 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 
-from stillmap.core import arrays
+from stillmap.core import arrays, se2
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.array_types import Float, Float32, Index, Int64
 from stillmap.core.config import CheckedOptions, option
@@ -125,36 +125,29 @@ def track_objects(
 class _ObjectStore:
     """Objects whose arrays are slices of a few large, memory-mapped ones."""
 
-    _OF_SCANS: ClassVar = {"scan": np.intp, "stamp_ns": np.int64, "xy": float, "velocity": float}
-
     def __init__(self, scratch: Path | None) -> None:
-        self._beams = ArrayBuilder(np.intp, (), scratch)
-        self._columns = {
-            name: ArrayBuilder(dtype, (2,) if dtype is float else (), scratch)
-            for name, dtype in self._OF_SCANS.items()
-        }
-        self._rows: list[tuple[int, int, tuple[float, ...], float, float]] = []
+        types = {"scan": np.intp, "stamp_ns": np.int64, "beams": np.intp}
+        self._columns = {name: ArrayBuilder(dtype, (), scratch) for name, dtype in types.items()}
+        for name in ("xy", "velocity"):
+            self._columns[name] = ArrayBuilder(float, (2,), scratch)
+        self._movers = list[tuple[MovingObject, dict[str, slice]]]()
 
     def add(self, mover: MovingObject) -> None:
-        self._rows.append(
-            (len(mover.scan), len(mover.beams), mover.size, mover.p_dynamic, mover.p_identity)
-        )
-        self._beams.append(mover.beams)
+        spans, nothing = dict[str, slice](), dict[str, Any]()
         for name, column in self._columns.items():
-            column.append(getattr(mover, name))
+            array = getattr(mover, name)
+            spans[name] = slice(len(column), len(column) + len(array))
+            column.append(array)
+            nothing[name] = array[:0].copy()  # the whole would stay in memory
+        self._movers.append((dataclasses.replace(mover, **nothing), spans))
 
     def objects(self) -> list[MovingObject]:
-        """All objects, their ids 0; nothing can be added afterwards."""
-        beams = self._beams.finish()
-        columns = {name: column.finish() for name, column in self._columns.items()}
-        out, scan, beam = [], 0, 0
-        for n_scans, n_beams, size, p_dynamic, p_identity in self._rows:
-            at, stamps, xy, velocity = (c[scan : scan + n_scans] for c in columns.values())
-            mine = beams[beam : beam + n_beams]
-            p = p_dynamic, None, p_identity
-            out.append(MovingObject(0, at, stamps, xy, velocity, size, mine, *p))
-            scan, beam = scan + n_scans, beam + n_beams
-        return out
+        """All objects in their order; nothing can be added afterwards."""
+        columns: dict[str, Any] = {name: column.finish() for name, column in self._columns.items()}
+        return [
+            dataclasses.replace(mover, **{name: columns[name][spans[name]] for name in spans})
+            for mover, spans in self._movers
+        ]
 
 
 def _make_object(
@@ -202,8 +195,7 @@ def estimate_center_offset(centroid: Float, sensor: Float, xy: Float, at: Index)
     """
     away = centroid - sensor
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    offset = xy - centroid[at]
-    across = offset[:, 1] * away[at, 0] - offset[:, 0] * away[at, 1]
+    _, across = se2.along_and_across(xy - centroid[at], away[at])
     low, high = np.full(len(centroid), np.inf), np.full(len(centroid), -np.inf)
     np.minimum.at(low, at, across)
     np.maximum.at(high, at, across)
@@ -221,8 +213,7 @@ def measure_box(offset: Float, velocity: Float) -> tuple[float, float]:
     speed = np.linalg.norm(velocity, axis=1)
     if np.median(speed) > HEADING_SPEED:
         heading = velocity / np.maximum(speed, 1e-9)[:, None]
-        along = (offset * heading).sum(axis=1)
-        across = offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1]
+        along, across = se2.along_and_across(offset, heading)
     else:
         axes = np.linalg.eigh(offset.T @ offset)[1]
         across, along = (offset @ axes).T

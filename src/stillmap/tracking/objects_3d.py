@@ -56,7 +56,7 @@ def track_objects_3d(
         return []
     planar_poses = se2.project_to_plane(recording.T_map_sensor(poses))
     points, nearest, offset, segment, beam = _segment_scans(
-        recording, poses, planar_poses, p_static, ground, MIN_P_DYNAMIC, threads
+        recording, poses, planar_poses, p_static, ground, threads
     )
     planar = make_planar_recording(recording, points, np.ones(len(nearest), np.bool_), offset)
     objects = track_objects(planar, planar_poses, p_static[nearest], options)
@@ -74,7 +74,6 @@ def _segment_scans(
     planar_poses: Float,
     p_static: Float32,
     ground: GroundMap,
-    min_p_dynamic: float,
     threads: int,
 ) -> tuple[Float32, Index, Int64, Index, Index]:
     """Segments of dynamic end points above the ground.
@@ -91,7 +90,7 @@ def _segment_scans(
 
     def process(t: int) -> tuple[Index, Index, Float, Index]:
         beams = recording.beams_of(t)
-        dynamic = recording.hit[beams] & (p_static[beams] <= 1.0 - min_p_dynamic)
+        dynamic = recording.hit[beams] & (p_static[beams] <= 1.0 - MIN_P_DYNAMIC)
         number, T = beams.start + np.flatnonzero(dynamic), T_map_sensor[t]
         end = recording.points.take(number, axis=0).astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         above = end[:, 2] - ground.height_at(end[:, :2])

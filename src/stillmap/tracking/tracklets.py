@@ -8,18 +8,10 @@ from stillmap.core import arrays
 from stillmap.core.array_types import Bool, Float, Index
 from stillmap.core.square_box import component_labels
 from stillmap.em.people_tracker import MIN_TRACK_SCANS
+from stillmap.tracking import detections
 from stillmap.tracking.association import HORIZON, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints
-from stillmap.tracking.detections import (
-    Centroids,
-    collect_centroids,
-    compute_centroids,
-    count_tracks,
-    find_near_pairs,
-    measure_widths,
-    renumber,
-    scan_blocks,
-)
+from stillmap.tracking.detections import Centroids
 from stillmap.tracking.fast_movers import tracks_of_paths
 from stillmap.tracking.joins import Detections, join_pieces
 from stillmap.tracking.mover_path import MoverPath
@@ -44,7 +36,7 @@ def cut_tracks(centroids: Centroids, seconds: Float, whole: Index) -> Index:
     """
     t, may_be_cut = seconds[centroids.scan], ~np.isin(centroids.track, whole)
     near = np.zeros(len(t), bool)
-    near[find_near_pairs(centroids.scan, centroids.xy, _NEAR).ravel()] = True
+    near[detections.find_near_pairs(centroids.scan, centroids.xy, _NEAR).ravel()] = True
     near = _select_short_runs(np.flatnonzero(near & may_be_cut), centroids.track, t)
     begins = np.diff(centroids.track, prepend=-1) != 0
     begins |= np.diff(near, prepend=False)
@@ -143,16 +135,16 @@ def join_tracklets(
     """
     owner = _merge_pairs(points, owner)
     fast = np.array(tracks_of_paths(points, owner, list(paths)), np.intp)
-    centroids = collect_centroids(points, owner)
+    centroids = detections.collect_centroids(points, owner)
     piece = cut_tracks(centroids, points.seconds, fast)
     own = np.flatnonzero(piece >= 0)
     outside, piece_of = Centroids._make(column[own] for column in centroids), piece[own]
     n = int(piece.max(initial=-1)) + 1
     is_fast = np.zeros(n, bool)
     is_fast[piece_of] = np.isin(outside.track, fast)
-    width = measure_widths(points, outside)
-    detections = Detections(piece_of, points.seconds[outside.scan], outside.xy, width)
-    mover, p_identity = join_pieces(detections, is_fast, points.period)
+    width = detections.measure_widths(points, outside)
+    found = Detections(piece_of, points.seconds[outside.scan], outside.xy, width)
+    mover, p_identity = join_pieces(found, is_fast, points.period)
     # who is near others all the time keeps his track
     number = n + centroids.track
     number[own] = mover[piece_of]
@@ -161,7 +153,7 @@ def join_tracklets(
     rest = np.concatenate([np.zeros(0, np.intp), *parts])
     nearest = assign_to_paths(points, rest, outside, mover[piece_of])
     out[rest[nearest >= 0]] = nearest[nearest >= 0]
-    return out, np.append(p_identity, np.ones(count_tracks(owner)))
+    return out, np.append(p_identity, np.ones(detections.count_tracks(owner)))
 
 
 def _number_points(
@@ -178,10 +170,10 @@ def _number_points(
 
 def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     """Merge tracks that always move together, nearer than people do: legs tracked apart."""
-    parts, scans = list[tuple[Index, Index]](), np.zeros(count_tracks(owner), np.intp)
-    for here in scan_blocks(points, owner):
-        centroids = compute_centroids(points, owner, here)
-        near = find_near_pairs(centroids.scan, centroids.xy, _PAIR_DISTANCE)
+    parts, scans = list[tuple[Index, Index]](), np.zeros(detections.count_tracks(owner), np.intp)
+    for here in detections.scan_blocks(points, owner):
+        centroids = detections.compute_centroids(points, owner, here)
+        near = detections.find_near_pairs(centroids.scan, centroids.xy, _PAIR_DISTANCE)
         pairs = np.sort(centroids.track[near], axis=1)
         parts.append(np.unique(pairs, axis=0, return_counts=True))
         scans += np.bincount(centroids.track, minlength=len(scans))
@@ -195,20 +187,22 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     label = component_labels(tracks[together], len(scans))
     _, first, which = np.unique(label, return_index=True, return_inverse=True)
     merged = first[which]
-    return renumber(points, owner, lambda old: merged[old])
+    return detections.renumber(points, owner, lambda old: merged[old])
 
 
 def _confirm(points: DynamicPoints, owner: Index) -> Index:
     """Set the points of tracks that are too short to -1."""
-    n = count_tracks(owner)
+    n = detections.count_tracks(owner)
     if n == 0:
         return owner
     scans, first, last = np.zeros(n, np.intp), np.full(n, np.inf), np.full(n, -np.inf)
-    for here in scan_blocks(points, owner):
-        centroids = compute_centroids(points, owner, here)
+    for here in detections.scan_blocks(points, owner):
+        centroids = detections.compute_centroids(points, owner, here)
         scans += np.bincount(centroids.track, minlength=n)
         np.minimum.at(first, centroids.track, points.seconds[centroids.scan])
         np.maximum.at(last, centroids.track, points.seconds[centroids.scan])
     duration = np.subtract(last, first, out=np.zeros(n), where=scans > 0)
     confirmed = (scans >= MIN_TRACK_SCANS) & (duration >= _MIN_DURATION)
-    return renumber(points, owner, lambda old: np.where((old >= 0) & confirmed[old], old, -1))
+    return detections.renumber(
+        points, owner, lambda old: np.where((old >= 0) & confirmed[old], old, -1)
+    )

@@ -68,7 +68,7 @@ def street(
     met = np.concatenate(whose)
     objects = [_object(k, part, cars, recording, poses, met) for k, part in enumerate(parts)]
     things = [
-        TrackedBox(fit_box(one, 0, 0.5), one.z - 0.5 * one.size[2], one.size[2]) for one in objects
+        TrackedBox(fit_box(one, 0), one.z - 0.5 * one.size[2], one.size[2]) for one in objects
     ]
     p_static = np.where(met >= 0, 0.05, 0.95).astype(np.float32)
     return MeshInputs(recording, recording, poses, p_static, objects, things, 0)

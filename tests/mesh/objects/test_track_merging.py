@@ -66,7 +66,7 @@ def test_a_track_of_two_cars_does_not_make_them_one() -> None:
     names = ("scan", "stamp_ns", "xy", "velocity", "beams", "z")
     ways = {name: np.concatenate([getattr(one, name) for one in (first, last)]) for name in names}
     both = dataclasses.replace(first, **ways)
-    thing = TrackedBox(fit_box(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
+    thing = TrackedBox(fit_box(both, 0), np.zeros(len(both.scan)), both.size[2])
     objects, things = [*sources.objects[:2], both], [*sources.boxes[:2], thing]
     sources = dataclasses.replace(sources, objects=objects, boxes=things)
     assert sorted(_wholes(sources)) in ([[0, 2], [1]], [[0], [1, 2]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stillmap.mesh import triangulation, tsdf
+from stillmap.mesh import triangle_mesh, triangulation
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.tsdf import build_surface
 
@@ -87,8 +87,8 @@ def test_what_moves_is_no_surface(room):
 
 def test_tiles_join_without_a_crack(walked, monkeypatch):
     with monkeypatch.context() as raw:
-        raw.setattr(tsdf, "simplification_error", lambda _: 0.0)
-        raw.setattr(tsdf, "remove_small_components", lambda mesh, _: mesh)
+        raw.setattr(triangle_mesh, "simplification_error", lambda _: 0.0)
+        raw.setattr(triangle_mesh, "remove_small_components", lambda mesh, _: mesh)
         whole = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
         monkeypatch.setattr("stillmap.mesh.tsdf.TILE", 16)
         tiled = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)

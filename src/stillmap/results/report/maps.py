@@ -10,7 +10,7 @@ from PIL import Image
 
 from stillmap.core.array_types import Float32
 from stillmap.core.grid_map import GridMap
-from stillmap.mapping.beam_statistics import sample_points
+from stillmap.mapping.labelled_recording import sample_points
 from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Snapshot, Window, extent

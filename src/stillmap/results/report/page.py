@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.core import config, errors, json
-from stillmap.mapping.beam_statistics import count_beams
+from stillmap.mapping.labelled_recording import count_beams
 from stillmap.pipeline.quality import describe_quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.tilting import TiltingResult

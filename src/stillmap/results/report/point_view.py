@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core.array_types import Float, Float32
-from stillmap.mapping.beam_statistics import sample_points
+from stillmap.mapping.labelled_recording import sample_points
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.tilting import TiltingResult
 from stillmap.results.colors import ORANGE, color_by_height

@@ -17,7 +17,7 @@ from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
-from stillmap.mapping.beam_statistics import sample_points
+from stillmap.mapping.labelled_recording import sample_points
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
 from stillmap.results.objects import interpolate_pose
