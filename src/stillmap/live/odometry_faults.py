@@ -39,7 +39,6 @@ _LEAP = 1.0  # m between two scans, and times the speed below, beyond which odom
 _DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
 _MAX_SPEED = 3.0  # m/s of robots
 _MAX_STAMPS = 500  # of scans that a fault may change in hindsight
-_UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
 
 # m and rad, standard deviations beyond which the search next to odometry may miss the pose
 _FAR = 0.05, 0.02
@@ -139,35 +138,24 @@ class Fault:
     match: ScanMatch
 
 
-class _LatestIncrement:
-    """The increment of odometry to the scan that is being registered, whatever the index."""
-
-    value: Float | None = None
-
-    def __getitem__(self, index: int, /) -> Float:
-        return _UNKNOWN if self.value is None else self.value
-
-
 class OdometryFaults:
     """Tests odometry scan by scan.
 
     Args:
         options: see OdometryOptions.
+
+    Attributes:
+        increment: (3, 3) of odometry to the scan that is being registered; None: there is none.
     """
 
     def __init__(self, options: OdometryOptions) -> None:
         self._options = options
-        self._increment = _LatestIncrement()
-        self._slip, self._standing = SlipDetector(self._increment), StandingTest()
+        self.increment: Float | None = None
+        self._slip, self._standing = SlipDetector(), StandingTest()
         self._stands = False  # confirmed, and odometry has not agreed with a scan since
         self._leaped_ns: int | None = None
         self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
         self._count = 0
-
-    @property
-    def increment(self) -> Float | None:
-        """(3, 3) of odometry to the scan that is being registered; None: there is none."""
-        return self._increment.value
 
     def predict(
         self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
@@ -182,8 +170,8 @@ class OdometryFaults:
             ns: stamp of the scan.
             seconds: since the last one.
         """
-        self._increment.value, self._guess, self._ns = increment, guess, ns
-        is_slipping = self._slip.is_slipping(self._count, pose, guess)
+        self.increment, self._guess, self._ns = increment, guess, ns
+        is_slipping = self._slip.is_slipping(pose, guess, increment)
         if increment is None:
             return guess
         if not _is_plausible(increment, seconds):
@@ -218,15 +206,14 @@ class OdometryFaults:
             is_odometry: the prior is that of odometry.
             may_stand: if it does, that is believed now: what keeps its place is not people.
         """
-        guess = self._guess
-        slip = self._slip.detect(self._count, pose, guess, grid, scan, match)
+        guess, increment = self._guess, self.increment
+        slip = self._slip.detect(self._count, pose, guess, increment, grid, scan, match)
         if slip is not None:
             back = min(self._count - slip.first, len(self._stamps))
             # the velocity is that of the hypothesis, too
             before = [slip.before, *(step.T_map_base for step in slip.matches)][-2]
             self._standing.reset()
             return Fault(self._stamps[-back] if back else None, before, slip.matches[-1])
-        increment = self.increment
         if increment is None:
             return None
         if self._stands:

@@ -7,7 +7,6 @@ is summed over the scans.
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -23,13 +22,6 @@ _DECISIVE = 10.0  # nats of gain from which odometry is rejected, of loss from w
 _MIN_STEP = 0.02  # m and rad between scans: a slower robot may as well have stopped
 _STILL_RATIO = 0.2  # of the predicted step: shorter odometry steps count as standing still
 _MAX_SCANS = 500  # of one hypothesis
-
-
-class Increments(Protocol):
-    """Increments of odometry by the index of the scan before."""
-
-    def __getitem__(self, index: int, /) -> Float:
-        """(3, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +42,9 @@ class SlipHypothesis:
 
 
 class SlipDetector:
-    """Tests for wheel slip scan by scan.
+    """Tests for wheel slip scan by scan."""
 
-    Args:
-        increments: (T - 1, 3, 3) of odometry, or what gives one for each index; None: no odometry,
-            no slip.
-    """
-
-    def __init__(self, increments: "Float | Increments | None") -> None:
-        self._increments = increments
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -66,17 +52,17 @@ class SlipDetector:
         self._is_slipping = False
         self._hypothesis: SlipHypothesis | None = None
 
-    def is_slipping(self, t: int, last: Float, guess: MotionPrior) -> bool:
-        """True if a detected slip still holds on the way to scan t.
+    def is_slipping(self, last: Float, guess: MotionPrior, increment: Float | None) -> bool:
+        """True if a detected slip still holds on the way to the next scan.
 
         Args:
-            t: the scan.
             last: (3, 3) T_map_base of the scan before.
-            guess: constant-velocity prior of scan t.
+            guess: constant-velocity prior of the scan.
+            increment: (3, 3) of odometry; None: there is none.
         """
         if self._is_slipping:  # a robot that pauses does not make its odometry valid again
             step = max(_step_size(se2.inverse(last) @ guess.T_map_base), _MIN_STEP)
-            self._is_slipping = self._odometry_step(t) < _STILL_RATIO * step
+            self._is_slipping = _step_size(increment) < _STILL_RATIO * step
         return self._is_slipping
 
     def detect(
@@ -84,6 +70,7 @@ class SlipDetector:
         t: int,
         last: Float,
         guess: MotionPrior,
+        increment: Float | None,
         grid: _core.OccupancyGrid2D,
         scan: Scan,
         match: ScanMatch,
@@ -91,14 +78,15 @@ class SlipDetector:
         """The slip hypothesis, at the scan that confirms it.
 
         Args:
-            t, last, guess: as of `is_slipping`.
+            t: number of the scan.
+            last, guess, increment: as of `is_slipping`.
             grid: the local map.
             scan: scan t.
             match: its match by the prior, which is odometry unless that is implausible.
         """
         if self._is_slipping:
             return None
-        onward = self._predict(t, last, guess) if len(scan.points) else None
+        onward = self._predict(last, guess, increment) if len(scan.points) else None
         if onward is None:
             self._hypothesis = None
         else:
@@ -108,15 +96,17 @@ class SlipDetector:
             confirmed, self._hypothesis, self._is_slipping = self._hypothesis, None, True
             return confirmed
         # rotation shows at once
-        self._is_slipping = match.contradicts_odometry and self.stands_still(
-            t, last, match.T_map_base
+        self._is_slipping = match.contradicts_odometry and _stands_still(
+            increment, last, match.T_map_base
         )
         if self._is_slipping:
             self._hypothesis = None
         return None
 
-    def _predict(self, t: int, last: Float, guess: MotionPrior) -> MotionPrior | None:
-        """Prior of scan t at constant velocity; None if odometry moves or velocity is unknown."""
+    def _predict(
+        self, last: Float, guess: MotionPrior, increment: Float | None
+    ) -> MotionPrior | None:
+        """Prior of the scan at constant velocity; None if odometry moves or velocity is unknown."""
         hypothesis = self._hypothesis
         if hypothesis is not None:
             if len(hypothesis.matches) == _MAX_SCANS:
@@ -127,7 +117,7 @@ class SlipDetector:
             guess = motion_model.gaussian_prior(ahead, guess.translation_std, guess.rotation_std)
         elif guess.translation_std > _step_size(se2.inverse(last) @ guess.T_map_base):
             return None
-        return guess if self.stands_still(t, last, guess.T_map_base) else None
+        return guess if _stands_still(increment, last, guess.T_map_base) else None
 
     def _extend(self, t: int, last: Float, moved: ScanMatch, gain: float) -> None:
         """Adds the match of scan t to the hypothesis, or rejects it where the robot stopped."""
@@ -137,16 +127,16 @@ class SlipDetector:
         has_stopped = gain < -_DECISIVE
         self._hypothesis = None if has_stopped else dataclasses.replace(hypothesis, gain=gain)
 
-    def stands_still(self, t: int, last: Float, T_map_base: Float) -> bool:
-        """True if odometry stands still on the way to scan t at a pose (3, 3) that moved."""
-        step = _step_size(se2.inverse(last) @ T_map_base)
-        return step > _MIN_STEP and self._odometry_step(t) < _STILL_RATIO * step
 
-    def _odometry_step(self, t: int) -> float:
-        """Size of the odometry step to scan t."""
-        return np.inf if self._increments is None else _step_size(self._increments[t - 1])
+def _stands_still(increment: Float | None, last: Float, T_map_base: Float) -> bool:
+    """True if odometry stands still on the way from a pose (3, 3) to another that moved."""
+    step = _step_size(se2.inverse(last) @ T_map_base)
+    return step > _MIN_STEP and _step_size(increment) < _STILL_RATIO * step
 
 
-def _step_size(increment: Float) -> float:
+def _step_size(increment: Float | None) -> float:
+    """m and rad together; without odometry no small step."""
+    if increment is None:
+        return np.inf
     x, y, theta = se2.parameters(increment)
     return float(np.hypot(x, y) + abs(theta))
