@@ -226,6 +226,13 @@ def is_inconsistent(prior: MotionPrior, T_map_base: Float) -> bool:
     return off > _INCONSISTENT_STDS
 
 
+def is_narrow(prior: MotionPrior) -> bool:
+    """True if the window of a prior is no wider than the first of the wider searches."""
+    stds = prior.translation_std, prior.rotation_std
+    widest = zip(stds, _WIDE_WINDOWS[0], strict=True)
+    return all(_SEARCH_STDS * std <= half for std, half in widest)
+
+
 def search_pose(
     grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, translation: float, rotation: float
 ) -> ScanMatch:
