@@ -31,10 +31,7 @@ if TYPE_CHECKING:
     from stillmap.live.replay import Show
     from stillmap.pipeline.options import Options
 
-_NO_ROS = (
-    "call `source /opt/ros/DISTRO/setup.bash` first, with the Python that this ROS was built for, "
-    "or install stillmap into an environment that has rclpy"
-)
+
 FLAGS = f"""
 --replay INPUT  a recording (default: a ROS 2 node that maps until Ctrl-C)
 -o --output DIR!  result folder
@@ -134,43 +131,21 @@ def _replay(
 def _run_node(
     args: argparse.Namespace, options: "Options", settings: dict[str, Any], show: "Show | None"
 ) -> int:
-    """Map in the user's own ROS 2 until Ctrl-C or SIGTERM, then write the result.
-
-    Raises:
-        InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
-        KeyboardInterrupt: Ctrl-C again while the result is written.
-    """
+    """Map until Ctrl-C or SIGTERM, then write the result."""
     from stillmap.live.mapper import LiveMapper
-    from stillmap.live.replay import signal_flag
+    from stillmap.live.ros.run import run
 
-    try:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-
-        from stillmap.live.ros.node import LiveNode
-    except ImportError as error:  # a package that is missing, or made for another Python
-        raise InputError(f"ROS 2 cannot be imported: {error}", hint=_NO_ROS) from error
-    try:
-        words = ["--ros-args", *args.ros_args]
-        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        raise InputError(f"arguments of ROS: {error}") from error
-    live, make_mapper = None, partial(LiveMapper, **settings)
-    try:
-        live = LiveNode(options, Path(args.output), args.overwrite, make_mapper, show)
-        with signal_flag() as stop:
-            try:
-                live.spin(stop)
-            finally:  # whatever ended it: nobody drives the same way again
-                if live.scans:
-                    with show_progress(args.quiet, 1) as progress:
-                        live.save(progress)
-    finally:
-        if live is not None:
-            live.close()
-        rclpy.try_shutdown()
+    scans = run(
+        options,
+        Path(args.output),
+        ["--ros-args", *args.ros_args],
+        overwrite=args.overwrite,
+        make_mapper=partial(LiveMapper, **settings),
+        show_progress=partial(show_progress, args.quiet, 1),
+        show=show,
+    )
     if not args.quiet:
-        say(f"wrote {args.output}" if live.scans else "no scan arrived: nothing was written")
+        say(f"wrote {args.output}" if scans else "no scan arrived: nothing was written")
     return 0
 
 
