@@ -104,6 +104,17 @@ def test_a_pause_is_no_proof_that_the_robot_was_carried():
     np.testing.assert_allclose(paused.explained, usual.explained, atol=0.05)
 
 
+def test_a_scan_without_returns_after_a_pause_begins_no_segment():
+    once = drive(2, laser={"beams": 120, "range_noise": 0.01, "max_range": 20.0})
+    recording, first = once.recording, once.recording.n_scans // 2
+    stamp_ns, hit = recording.stamp_ns.copy(), recording.hit.copy()
+    stamp_ns[first:] += 120 * 10**9
+    hit[recording.beams_of(first)] = False
+    paused = mapped(dataclasses.replace(recording, stamp_ns=stamp_ns, hit=hit))
+    assert paused.diagnostics.segments == []
+    assert ate(paused, once.truth) < 0.05
+
+
 @pytest.mark.parametrize("seed", [0, *slow_params(3)])
 def test_a_gap_in_which_odometry_errs(seed):
     # 12 s are lost; after 3.4 m odometry is off by .42 m and .25 rad, within its covariance

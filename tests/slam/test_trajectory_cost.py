@@ -60,6 +60,21 @@ def test_motion_at_constant_velocity_is_less_certain_over_longer_times():
     assert std[0, 0] < std[2, 0]
 
 
+def test_where_cells_begin_is_no_evidence():
+    # walls of the room lie along the cells
+    simulation = drive(2, robot={"scans": 20})
+    recording, poses = simulation.recording, simulation.truth.T_world_base
+    e, scans = np.ones(recording.n_beams, np.float32), np.arange(len(poses))
+    evidence, of_grids = [], []
+    for shift in (0.0, 0.025):
+        moved = se2.matrix(shift, shift, 0.0) @ poses
+        evidence.append(trajectory_cost.map_evidence(recording, e, scans, moved, 0.05))
+        grid = scan_hits.count_beams(recording, e, scans, moved, 0.05)
+        of_grids.append(0.2 * grid.log_evidence(0.02, 0.5))
+    assert evidence == pytest.approx([np.mean(of_grids)] * 2, abs=1.0)
+    assert abs(of_grids[0] - of_grids[1]) > 20.0
+
+
 def test_evidence_gain_is_that_of_beta_distributions():
     simulation = drive(2, robot={"scans": 20})
     recording, poses = simulation.recording, simulation.truth.T_world_base

@@ -112,14 +112,11 @@ class FrontEnd:
         return match, is_poor(match, usual)
 
     def confirms(self, prior: MotionPrior, match: ScanMatch, sensor: str | int) -> bool:
-        """True if a scan fits where its prior leads; if that may be one of several places, as well
-        as scans of that sensor usually do."""
+        """True if a scan fits; if its prior may lead to one of several places, as well as usual."""
         usual = self.usual.get(sensor, 1.0)
-        if scan_matching.is_inconsistent(prior, match.T_map_base) or is_poor(match, usual):
-            return False
-        return (
-            scan_matching.is_narrow(prior) or match.explained >= scan_matching.LOCAL_SHARE * usual
-        )
+        if not scan_matching.is_narrow(prior):
+            return match.explained >= scan_matching.LOCAL_SHARE * usual
+        return not is_poor(match, usual)
 
     def search_wider(
         self,

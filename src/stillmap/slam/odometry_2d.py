@@ -108,19 +108,22 @@ class _ScanOdometry:
         if has_map:
             match, poor = front_end.match(grid, scan, s, prior, learned, alternative)
             poor = poor and is_seen
-        after_gap = is_gap(seconds, self.seconds, (learned or prior).translation_std)
-        if after_gap and self.search_wider and not front_end.confirms(learned or prior, match, s):
+        motion = learned or prior
+        is_off = is_inconsistent(motion, match.T_map_base)
+        is_off = is_off or (is_seen and not front_end.confirms(motion, match, s))
+        after_gap = is_gap(seconds, self.seconds, motion.translation_std)
+        if is_off and after_gap and self.search_wider:
             # one scan that fits somewhere near does not say where the robot went, or was carried,
             # while nothing was recorded: all that follow decide
-            self._start_segment(t, learned or prior)
+            self._start_segment(t, motion)
             return
         if poor and self.search_wider:
             match, evidence = front_end.search_wider(grid, scan, s, prior, alternative, match)
         front_end.weigh(t, match.T_map_base, seconds, evidence)
         self._record(t, match, is_fault=self._rejects_odometry(t, prior, alternative, match))
-        self._note_drift(t, learned or prior, match, seconds)
+        self._note_drift(t, motion, match, seconds)
         if is_seen:
-            front_end.learn(s, learned or prior, match, self.seconds)
+            front_end.learn(s, motion, match, self.seconds)
         self.travelled += front_end.advance(match.T_map_base)
         if evidence is not Evidence.CONTRADICTS:
             self.local_map.add(t, match.T_map_base, self.travelled)

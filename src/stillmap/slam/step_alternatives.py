@@ -287,8 +287,7 @@ class _Comparison:
 
     def _scan_cost(self, poses: Float, scans: Index) -> float:
         """-ln of the evidence of the map of scans (n,) at poses (n, 3, 3)."""
-        grid = scan_hits.count_beams(self.recording, self.e, scans, poses, self.options.resolution)
-        return -map_evidence(grid)
+        return -map_evidence(self.recording, self.e, scans, poses, self.options.resolution)
 
     def _close_part(self, trajectory: MStepResult, scans: Index) -> Float:
         """Poses of scans (n,) with the loops among them closed."""
