@@ -213,7 +213,12 @@ def sample_indices(count: int, max_count: int) -> NDArray[np.int64]:
 def expand_ranges(
     first: NDArray[np.intp], count: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers first, first + 1, ... of n ranges with counts (n,): which range each is of; them."""
+    """The range that each number is of, and the numbers themselves, of n ranges of integers.
+
+    Args:
+        first: (n,) their first numbers.
+        count: (n,) how many follow each other.
+    """
     of = np.repeat(np.arange(len(count)), count)
     return of, np.arange(len(of)) + np.repeat(first - np.cumsum(count) + count, count)
 

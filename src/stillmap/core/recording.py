@@ -91,7 +91,7 @@ class Recording(ShortRepr):
             raise ValueError("stamp_ns: expected times from 1824 to 2116")
         ends = (self.offset[0], self.offset[-1])
         if ends != (0, M) or np.any(self.offset[1:] < self.offset[:-1]):
-            raise ValueError(f"offset: must rise from 0 to {M}")
+            raise ValueError(f"offset: must not decrease, from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
             raise ValueError(f"sensor: indices must lie in [0, {S})")
 

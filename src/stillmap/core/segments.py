@@ -20,10 +20,10 @@ def segments_meet_box(start: Float, end: Float, half_size: Float) -> Bool:
         at = start[..., axis]
         along = end[:, axis] - at
         with np.errstate(divide="ignore", invalid="ignore"):
-            one, other = (-half - at) / along, (half - at) / along
+            low, high = (-half - at) / along, (half - at) / along
         # parallel to the faces: all of the segment lies between them, or nothing
         beside = np.where(np.abs(at) > half, np.inf, -np.inf)
         is_parallel = along == 0.0
-        enters = np.maximum(enters, np.where(is_parallel, beside, np.minimum(one, other)))
-        leaves = np.minimum(leaves, np.where(is_parallel, -beside, np.maximum(one, other)))
+        enters = np.maximum(enters, np.where(is_parallel, beside, np.minimum(low, high)))
+        leaves = np.minimum(leaves, np.where(is_parallel, -beside, np.maximum(low, high)))
     return np.asarray(enters <= leaves)

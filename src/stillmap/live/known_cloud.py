@@ -131,10 +131,10 @@ class KnownCloud:
         )
         gone &= ~there & grid.occupied
         there &= grid.occupied
-        left = replace(grid, p_occupied=np.where(gone, np.float32(0.0), grid.p_occupied))
+        remaining = replace(grid, p_occupied=np.where(gone, np.float32(0.0), grid.p_occupied))
         hits[gone] = 0.0
         points, p_static = self.points[stands].astype(np.float64), self.p_static[stands]
-        return KeptMap(left, hits, there, points, p_static, thin_route(self.poses))
+        return KeptMap(remaining, hits, there, points, p_static, thin_route(self.poses))
 
     def _columns(self, points: Float32) -> Bool:
         """(H, W) cells of the planar map in which points (N, 3) lie."""

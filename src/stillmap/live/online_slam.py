@@ -3,7 +3,6 @@
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator
-from itertools import compress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,7 +25,7 @@ from stillmap.live.robot_finder import Localizer, RobotFinder
 from stillmap.live.scan import BeamSelector, Observation, ScanBeams, deskew, find_margins
 from stillmap.live.scan_odometry import ScanOdometry, thin
 from stillmap.live.sweep_odometry import SweepOdometry
-from stillmap.live.update import DOUBTS, LaterLabels, Update
+from stillmap.live.update import LaterLabels, Update
 from stillmap.pipeline.map_frame import FIELDS
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam.scan_hits import Scan as PlanarHits
@@ -276,16 +275,21 @@ class OnlineSlam:
         )
 
     def _to_update(self, stamp_ns: int, registered: Registration, p_static: Float32) -> Update:
-        of_scan = registered.is_slipping, registered.is_blind
-        of_map = registered.is_carried, registered.is_contradicted
-        of_place = self._finder.is_lost, self._finder.is_ambiguous
-        doubts = tuple(compress(DOUBTS, (*of_scan, *of_map, *of_place)))
+        doubts = {
+            "slip": registered.is_slipping,
+            "blind": registered.is_blind,
+            "carried": registered.is_carried,
+            "contradicted": registered.is_contradicted,
+            "lost": self._finder.is_lost,
+            "ambiguous": self._finder.is_ambiguous,
+        }
         T, T_odom_base = self.frame.T_map_local, self._T_odom_base
         pose, covariance = T @ registered.T, se2.rotate_covariance(registered.covariance, T)
         T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
         changes, movers = self.labels.take_changes(stamp_ns), self._movers.movers(T)
         hindsight = list(self._label_recent(stamp_ns))
-        return Update(pose, covariance, p_static, T_map_odom, doubts, changes, movers, hindsight)
+        names = tuple(name for name, is_so in doubts.items() if is_so)
+        return Update(pose, covariance, p_static, T_map_odom, names, changes, movers, hindsight)
 
     def _label_recent(self, stamp_ns: int) -> Iterator[LaterLabels]:
         """Labels of the scans that are old enough now, and have none of later yet."""

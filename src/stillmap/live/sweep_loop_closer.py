@@ -168,9 +168,15 @@ class LiveSweepLoopCloser:
         odometry = LidarOdometry(poses, np.zeros((n, 6)), np.zeros((n, 6, 6)), context.explained)
         # loops lead back to all from before, in a wide window; and no submap has both places
         apart = _CARRIED_TRAVEL * np.cumsum(np.isin(context.keyframes, carried))
-        sweeps = context.recording, context.e, odometry, context.travelled + apart
-        distance = context.search_distance
-        return SweepLoopCloser(*sweeps, context.keyframes, distance, self._threads)
+        return SweepLoopCloser(
+            context.recording,
+            context.e,
+            odometry,
+            context.travelled + apart,
+            context.keyframes,
+            context.search_distance,
+            self._threads,
+        )
 
 
 def _find_untied(carried: Sequence[int], closures: Sequence[LoopClosure]) -> tuple[int, ...]:

@@ -99,9 +99,17 @@ class SweepOdometry:
             self._note_first(beams.stamp_ns, hits)
         T = self._state.T_map_base
         covariance = se2.rotate_covariance(self._state.covariance[:6, :6], T)
-        doubts = self._is_slipping, is_blind, is_carried, self._contradictions > 0
-        drift, twist = np.zeros((3, 3)), self._state.twist
-        return Registration(T, covariance, explained, drift, twist, *doubts)
+        return Registration(
+            T,
+            covariance,
+            explained,
+            drift=np.zeros((3, 3)),
+            twist=self._state.twist,
+            is_slipping=self._is_slipping,
+            is_blind=is_blind,
+            is_carried=is_carried,
+            is_contradicted=self._contradictions > 0,
+        )
 
     def add(
         self, beams: ScanBeams, e: Float32, _recent: Float32, _label: Labeller

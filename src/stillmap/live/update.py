@@ -8,7 +8,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
 
-# in the order of `Update.doubts`, for people
+# for people
 DOUBTS = MappingProxyType(
     {
         "slip": "odometry disagrees with the scans",

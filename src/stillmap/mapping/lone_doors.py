@@ -111,11 +111,11 @@ def find_lone_doors(surface: Cells, doors: Sequence[Door], known: LabelledRecord
         return []
     counts = _count_beams(known)
     free = [gap for gap in gaps if is_doorway_free(gap, counts)]
-    found = [
+    candidates = [
         find(gap, surface) for find in (find_open_leaf, doorways.find_shut_leaf) for gap in free
     ]
     taken, leaves = [door.swept_cells for door in doors], list[LoneLeaf]()
-    for leaf in found:
+    for leaf in candidates:
         if leaf is None or not len(leaf.cells):  # of coarse cells, all may be at the wall
             continue
         is_leaf = not leaf.is_open or is_thin(leaf, counts)

@@ -221,8 +221,8 @@ def _partial_scans(
         if len(part):
             seconds = returns.seconds[part]
             span = float(seconds.min()), float(seconds.max())
-            found = partial_scans.extract_partial_scan(own, span, frame, fast, returns)
-            out += [found] if found is not None else []
+            partial_scan = partial_scans.extract_partial_scan(own, span, frame, fast, returns)
+            out += [partial_scan] if partial_scan is not None else []
     # scans of several sensors overlap in time
     return sorted(out, key=lambda one: one.span[0] + one.span[1])
 

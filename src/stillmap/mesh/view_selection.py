@@ -230,10 +230,10 @@ def _log_ratios(view: Int32, colors: Float32) -> tuple[Int32, Int32, Float32]:
     first, second = ranks.reshape(-1, 2).T
     pair, face = np.nonzero((usable[:, first] & usable[:, second]).T)
     a, b = first[pair], second[pair]
-    one, other = view[face, a], view[face, b]
+    image_a, image_b = view[face, a], view[face, b]
     brighter = np.log(colors[face, b] / colors[face, a])
-    ratio = np.where((one < other)[:, None], brighter, -brighter)
-    return np.minimum(one, other), np.maximum(one, other), ratio
+    ratio = np.where((image_a < image_b)[:, None], brighter, -brighter)
+    return np.minimum(image_a, image_b), np.maximum(image_a, image_b), ratio
 
 
 def read_with_gains(images: Images, views: Sequence[View], gains: Float) -> Callable[[View], Image]:

@@ -17,7 +17,7 @@ from stillmap.em import OccupancyMap
 from stillmap.places.changes import PlaceChange
 from stillmap.places.evidence import BeamCells, Evidence, to_sums
 from stillmap.places.place_states import MIN_HITS, PlaceStates, Tile, are_near, iter_tiles
-from stillmap.results.timeline import last_observed
+from stillmap.results.timeline import find_last_observation
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -74,7 +74,7 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
         share = (observed * occupied).sum(axis=1) / np.maximum(observed.sum(axis=1), 1)
         p_shown = (share > 0.5).astype(np.float64)
     else:
-        p_shown = occupied[np.arange(len(occupied)), last_observed(observed, limit)]
+        p_shown = occupied[np.arange(len(occupied)), find_last_observation(observed, limit)]
     unchanged = states.p_changing <= 0.5
     p_shown = np.where(unchanged, np.maximum(p_shown, states.p_static), p_shown)
     stands, gone = _settle_unlisted(place, changes)

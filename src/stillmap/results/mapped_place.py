@@ -190,9 +190,16 @@ def _only_session(noted: Any, stamp_ns: Int64, poses: Float) -> timeline.PlaceSe
     D, path = poses.shape[-1] - 1, noted if isinstance(noted, str) and noted else None
     times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
     name, dof = input_stem(Path(path)) if path else "session", 3 * (D - 1)
-    frame = np.eye(D + 1), np.zeros((dof, dof))
-    scans = slice(0, len(stamp_ns))
-    return timeline.PlaceSession(name, path, True, "", *frame, 1.0, scans, *times)
+    return timeline.PlaceSession(
+        name,
+        path,
+        accepted=True,
+        T_place_session=np.eye(D + 1),
+        covariance=np.zeros((dof, dof)),
+        scans=slice(0, len(stamp_ns)),
+        first_ns=times[0],
+        last_ns=times[1],
+    )
 
 
 def input_stem(path: Path) -> str:

@@ -198,7 +198,7 @@ class ChangedCells(ShortRepr):
 
     def occupied_as_of(self, session: int) -> Bool:
         """(K,) what the last session up to this one saw, else the first one after."""
-        at = last_observed(self.observed, session)
+        at = find_last_observation(self.observed, session)
         return np.asarray(self.occupied[np.arange(len(at)), at])
 
     def within(self, changes: list[SessionChange]) -> Bool:
@@ -211,7 +211,7 @@ class ChangedCells(ShortRepr):
         return out
 
 
-def last_observed(observed: Bool, session: int) -> Index:
+def find_last_observation(observed: Bool, session: int) -> Index:
     """(K,) the last session up to this one that observed each cell (K, S), else the first after."""
     before = observed[:, : session + 1]
     last = session - np.argmax(before[:, ::-1], axis=1)

@@ -143,8 +143,8 @@ def join_tracklets(
     is_fast = np.zeros(n, bool)
     is_fast[piece_of] = np.isin(outside.track, fast)
     width = detections.measure_widths(points, outside)
-    found = Detections(piece_of, points.seconds[outside.scan], outside.xy, width)
-    mover, p_identity = join_pieces(found, is_fast, points.period)
+    of_pieces = Detections(piece_of, points.seconds[outside.scan], outside.xy, width)
+    mover, p_identity = join_pieces(of_pieces, is_fast, points.period)
     # who is near others all the time keeps his track
     number = n + centroids.track
     number[own] = mover[piece_of]

@@ -291,5 +291,12 @@ def _summarize(error: Float) -> Spread:
     if not len(error):
         return Spread(*[NAN] * 6)
     ddof = int(len(error) > 1)  # the deviation of one error is 0
-    spreads = [(values.mean(), values.std(ddof=ddof)) for values in (error, error**2)]
-    return Spread(*map(float, (*spreads[0], *spreads[1], np.median(error), error.max())))
+    squared = error**2
+    return Spread(
+        mean=float(error.mean()),
+        std=float(error.std(ddof=ddof)),
+        squared_mean=float(squared.mean()),
+        squared_std=float(squared.std(ddof=ddof)),
+        median=float(np.median(error)),
+        max=float(error.max()),
+    )
