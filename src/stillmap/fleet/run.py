@@ -78,7 +78,7 @@ class Fleet(NamedTuple):
     def failed(self) -> int:
         """How many recordings and places failed."""
         outcomes = [job.outcome for job in self.jobs] + [place.outcome for place in self.places]
-        return sum(outcome.status == "failed" for outcome in outcomes)
+        return sum(outcome.status not in ("done", "too few") for outcome in outcomes)
 
     def to_list(self) -> list[dict[str, Any]]:
         """The content of `fleet.json`: an entry for each recording."""

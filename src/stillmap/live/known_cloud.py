@@ -11,11 +11,12 @@ import stillmap._core as _core
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import unique_cells
 from stillmap.core.errors import InputError
+from stillmap.core.square_box import cell_keys
 from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.live.known_map import LOG_RATIO, KeptMap, KnownMap
 from stillmap.live.sweep_view import STANDS, count_up, is_level
-from stillmap.places.evidence import cell_keys, look_up
+from stillmap.places.evidence import look_up
 from stillmap.results.near_result import NearResult
 from stillmap.slam import lidar_odometry
 

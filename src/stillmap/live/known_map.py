@@ -15,11 +15,11 @@ from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import cell_keys
 from stillmap.em import OccupancyMap
 from stillmap.live.causal_labels import OccupancyFilter
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan, add_scan, relabel_scan
 from stillmap.pipeline.options import MapMode
-from stillmap.places.evidence import cell_keys
 from stillmap.places.surface_map import SurfaceMap, find_sides
 from stillmap.results import reader
 from stillmap.results.map_server import write_map_npz, write_map_server

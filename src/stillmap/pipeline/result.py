@@ -177,8 +177,15 @@ def map_recording(
     state.single_pass = (
         recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
     )
-    how: dict[str, Any] = {"poses": poses, "progress": progress, "stages": stages}
-    _run_em(iterate(recording, options, **how, previous=state.latest), state, checkpoint)
+    steps = iterate(
+        recording,
+        options,
+        poses=poses,
+        progress=progress,
+        stages=stages,
+        previous=state.latest,
+    )
+    _run_em(steps, state, checkpoint)
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
     recording = move_odometry(recording, odometry)

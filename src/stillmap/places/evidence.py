@@ -19,7 +19,7 @@ from stillmap.core import arrays, se2
 from stillmap.core.array_types import Float, Float32, Index, Int32, Int64
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.core.square_box import cell_keys as cell_keys
+from stillmap.core.square_box import cell_keys
 from stillmap.places.keyframes import Keyframes
 from stillmap.slam import PoseGraph
 

@@ -66,7 +66,7 @@ def read_clouds(
         extensions: of the files.
         read_cloud: reads one file, given the common `origin` and a `scratch` folder.
         context: see ReadContext.
-        in_sensor_frame: see `Origin.add_notes`.
+        in_sensor_frame: see `Origin.record_in`.
 
     Raises:
         InputError: no cloud can be read.
@@ -81,7 +81,7 @@ def read_clouds(
         for file, stamp in zip(files, stamps, strict=True)
     ]
     recording = build_recording(sources, notes, context, single=path.is_file())
-    origin.add_notes(recording, in_sensor_frame=in_sensor_frame)
+    origin.record_in(recording, in_sensor_frame=in_sensor_frame)
     return recording
 
 
@@ -262,12 +262,13 @@ class Origin:
         with np.errstate(over="ignore"):
             return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
-    def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
-        """Note the origin in the source of a recording, and warn that the sensor is assumed there;
-        neither where points are `in_sensor_frame` and near its origin.
+    def record_in(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
+        """Record by how much points were shifted, in place.
 
-        Of a recording with poses those of scans whose points were shifted say so instead: they are
-        the scans without a rotation and a position, beside others that have them.
+        In the poses where a recording has some, of the scans whose points were shifted: those
+        without a rotation and a position, beside others that have them. Else in its source, with a
+        warning that the sensor is assumed there; not where points are `in_sensor_frame` and near
+        its origin.
         """
         T = recording.T_recorded_base
         if T is not None:

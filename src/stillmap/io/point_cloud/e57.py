@@ -53,7 +53,7 @@ def read(path: Path, context: ReadContext) -> Recording:
     single = path.is_file() and len(sources) == 1
     notes = Source(str(path), format="E57")
     recording = clouds.build_recording(sources, notes, context, single=single)
-    origin.add_notes(recording)
+    origin.record_in(recording)
     return recording
 
 

@@ -118,7 +118,7 @@ def select_topics(bag: Bag, options: ReadOptions) -> tuple[dict[str, str], list[
     faults |= {c.id: "is empty" for c in bag.channels if not c.n_messages}
     of_scans = [c for c in bag.channels if c.type in messages.SCAN_TYPES]
     tilting = {f"{slash}{options.tilting_topic}" for slash in ("", "/")}
-    scans = _select_topics(bag, faults, options) or [c for c in of_scans if c.id not in faults]
+    scans = _find_channels(bag, faults, options) or [c for c in of_scans if c.id not in faults]
     scans = [c for c in scans if c.topic not in tilting]
     if not scans:
         named = [f": {c.topic} {faults[c.id]}" for c in of_scans if c.id in faults]
@@ -147,7 +147,7 @@ def select_topics(bag: Bag, options: ReadOptions) -> tuple[dict[str, str], list[
     return uses, notes
 
 
-def _select_topics(
+def _find_channels(
     bag: Bag, faults: dict[int, str], options: ReadOptions
 ) -> list[messages.Channel]:
     """The channels of the topics that the options name."""

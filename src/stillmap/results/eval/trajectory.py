@@ -178,8 +178,12 @@ def summarize_errors(error: Float) -> ErrorStats:
     """Summary of (N,) errors."""
     if not len(error):
         return ErrorStats(*[NAN] * 4)
-    rmse = np.sqrt(np.mean(error**2))
-    return ErrorStats(*map(float, (rmse, error.mean(), np.median(error), error.max())))
+    return ErrorStats(
+        rmse=float(np.sqrt(np.mean(error**2))),
+        mean=float(error.mean()),
+        median=float(np.median(error)),
+        max=float(error.max()),
+    )
 
 
 def read_paired_poses(result: Path, truth: Truth) -> tuple[Float, Float]:
