@@ -1,9 +1,12 @@
-"""Faults of wheel odometry as scans arrive: leaps, wheels that slip, wheels that spin; and where
-odometry alone may have led the robot."""
+"""Faults of wheel odometry as scans arrive, and where odometry alone may have led the robot.
+
+Odometry is valid or not: while it is not, scans are predicted at constant velocity. A fault that
+no single scan shows, of wheels that spin or odometry that stands still, is shown by a rival
+hypothesis about the motion, which has poses of its own.
+"""
 
 import dataclasses
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +14,13 @@ import numpy as np
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float
-from stillmap.live.slip_detection import SlipDetector
 from stillmap.slam import motion_model
 from stillmap.slam.front_end import Evidence, judge_scan
 from stillmap.slam.motion_model import MotionPrior, gaussian_prior
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
+    FAULT_COST,
     MIN_GAIN,
     ScanMatch,
     is_inconsistent,
@@ -28,17 +31,9 @@ from stillmap.slam.scan_matching import (
     search_pose,
 )
 
-_SPACING_NS = 10**8  # between scans that are compared
-_STD = 0.005, 0.003  # m and rad by which both hypotheses may differ from the poses they predict
-_REJECTED, _CONFIRMED = -10.0, 30.0  # nats of gain: the robot moves; it stands
-# scans compared and m of odometry, at least, before it stands; m after which the test begins anew
-_MIN_SCANS, _MIN_METRES, _MAX_METRES = 4, 0.3, 5.0
-_MIN_STEP = 0.02  # m or rad of odometry between compared scans: less, and it stands, too
-_FREE_STD = 0.02, 0.01  # m and rad, at least, of the prior while the robot stands
-_LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
-_DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
-_MAX_SPEED = 3.0  # m/s of robots
-_MAX_STAMPS = 500  # of scans that a fault may change in hindsight
+_STANDING_STD = 0.005, 0.003  # m and rad by which a robot that stands may seem to move
+_MIN_STEP = 0.02  # m and rad: hypotheses that are closer to each other are not compared
+_LEAP, _MAX_SPEED = 1.0, 3.0  # m between two scans, and m/s, beyond which odometry has leaped
 
 # m and rad, standard deviations beyond which the search next to odometry may miss the pose
 _FAR = 0.05, 0.02
@@ -53,89 +48,62 @@ _ALIKE = 0.3, 0.3  # m and rad within which two optima are one pose
 _MAX_UNKNOWN, _MAX_SCANS = 10, 100
 
 
-class StandingTest:
-    """The hypothesis that the robot stands.
-
-    Attributes:
-        first_ns: stamp of the first scan of the hypothesis.
-    """
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin anew with the next scan."""
-        self._pose: Float | None = None
-        self.first_ns, self._last_ns = 0, 0
-        self._gain, self._scans, self._metres = 0.0, 0, 0.0
-        self._step = np.eye(3)
-
-    def observe(
-        self, grid: _core.OccupancyGrid2D, scan: Scan, last: Float, T: Float, step: Float, ns: int
-    ) -> ScanMatch | None:
-        """Compare a scan at the pose by odometry with the standing pose.
-
-        Args:
-            grid: the local map.
-            scan: its hits, at least one.
-            last: (3, 3) T_map_base of the scan before.
-            T: (3, 3) of the scan, by odometry and the map.
-            step: (3, 3) of odometry.
-            ns: its stamp.
-
-        Returns:
-            The match of the standing pose, if the scans so far confirm it.
-        """
-        if self._pose is None:
-            self._pose, self.first_ns = last, ns
-        self._metres, self._step = self._metres + float(np.hypot(*step[:2, 2])), self._step @ step
-        if ns - self._last_ns < _SPACING_NS:
-            return None
-        x, y, theta = se2.parameters(self._step)
-        self._last_ns, self._step = ns, np.eye(3)
-        if max(np.hypot(x, y), abs(theta)) < _MIN_STEP or self._metres > _MAX_METRES:
-            self.reset()
-            return None
-        # labels that follow from the pose by odometry would leave out what contradicts it
-        every = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
-        standing, moving = (
-            refine_pose(grid, every, gaussian_prior(pose, *_STD), pose) for pose in (self._pose, T)
-        )
-        # by end points alone: the local map is smeared along a motion that was none, and beams of
-        # a robot that stands seem to pass through it
-        stands, moves = (
-            registration_cost(grid, every, match.T_map_base) for match in (standing, moving)
-        )
-        self._gain, self._scans = self._gain + moves - stands, self._scans + 1
-        if self._gain < _REJECTED:
-            self.reset()
-            return None
-        self._pose = standing.T_map_base
-        is_enough = self._scans >= _MIN_SCANS and self._metres >= _MIN_METRES
-        return standing if is_enough and self._gain > _CONFIRMED else None
-
-
-def standing_prior(pose: Float, increment: Float) -> MotionPrior:
-    """The prior of a robot that stands at a pose (3, 3), or moves on by odometry's step (3, 3)."""
-    x, y, theta = se2.parameters(increment)
-    return gaussian_prior(
-        pose, max(float(np.hypot(x, y)), _FREE_STD[0]), max(abs(float(theta)), _FREE_STD[1])
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Fault:
     """Odometry was wrong for some scans.
 
     Attributes:
-        first_ns: stamp of the first one; None: none is known.
+        first_ns: stamp of the first one.
         before: (3, 3) T_map_base of the scan before the last one.
         match: of the last one.
     """
 
-    first_ns: int | None
+    first_ns: int
     before: Float
     match: ScanMatch
+
+
+class RivalMotion:
+    """A hypothesis about the motion that odometry contradicts: its poses, and its evidence.
+
+    Args:
+        pose: (3, 3) T_map_base of the scan before the first one.
+        step: (3, 3) to it; the identity: the robot stands, else it goes on at constant velocity.
+        ns: stamp of the first scan.
+
+    Attributes:
+        gain: nats by which scans so far fit better than at the poses by odometry.
+    """
+
+    def __init__(self, pose: Float, step: Float, ns: int, *, stands: bool) -> None:
+        self.stands, self.first_ns, self.gain = stands, ns, 0.0
+        self.pose, self.step = pose, step
+
+    def observe(
+        self, grid: _core.OccupancyGrid2D, scan: Scan, T: Float, std: tuple[float, float]
+    ) -> Fault | None:
+        """Compare the pose of the next scan with that by odometry.
+
+        Args:
+            grid: the local map.
+            scan: its hits, at least one.
+            T: (3, 3) of the scan, by odometry and the map.
+            std: m and rad, of the motion at constant velocity.
+        """
+        prior = gaussian_prior(self.pose @ self.step, *(_STANDING_STD if self.stands else std))
+        if _size(se2.inverse(prior.T_map_base) @ T) < _MIN_STEP:
+            return None
+        # labels that follow from the pose by odometry would leave out what contradicts it
+        every = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
+        match = refine_pose(grid, every, prior, prior.T_map_base)
+        # by end points alone: the local map is smeared along a motion that was none, and beams of
+        # a robot that stands seem to pass through it
+        by_odometry, by_rival = (registration_cost(grid, every, at) for at in (T, match.T_map_base))
+        self.gain += by_odometry - by_rival
+        before, self.pose = self.pose, match.T_map_base
+        if not self.stands:
+            self.step = se2.inverse(before) @ self.pose
+        return Fault(self.first_ns, before, match) if self.gain > FAULT_COST else None
 
 
 class OdometryFaults:
@@ -151,17 +119,17 @@ class OdometryFaults:
     def __init__(self, options: OdometryOptions) -> None:
         self._options = options
         self.increment: Float | None = None
-        self._slip, self._standing = SlipDetector(), StandingTest()
-        self._stands = False  # confirmed, and odometry has not agreed with a scan since
-        self._leaped_ns: int | None = None
-        self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
-        self._count = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the past motion, after the robot was carried elsewhere."""
+        self._is_valid = True
+        self._rival: RivalMotion | None = None
 
     def predict(
         self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
     ) -> MotionPrior:
-        """The prior of the next scan: odometry where it is plausible, a robot that stands while its
-        wheels spin, else constant velocity.
+        """The prior of the next scan: by odometry while it is valid, else at constant velocity.
 
         Args:
             pose: (3, 3) T_map_base of the last scan.
@@ -171,17 +139,12 @@ class OdometryFaults:
             seconds: since the last one.
         """
         self.increment, self._guess, self._ns = increment, guess, ns
-        is_slipping = self._slip.is_slipping(pose, guess, increment)
         if increment is None:
             return guess
-        if not _is_plausible(increment, seconds):
-            self._leaped_ns = ns
-        if self._stands:
-            return standing_prior(pose, increment)
-        has_leaped = self._leaped_ns is not None and ns < self._leaped_ns + _DISTRUST_NS
-        if is_slipping or has_leaped:
-            return guess
-        return motion_model.odometry_prior(pose, increment, self._options)
+        if float(np.hypot(*increment[:2, 2])) > max(_LEAP, _MAX_SPEED * seconds):
+            self._is_valid = False
+        by_odometry = motion_model.odometry_prior(pose, increment, self._options)
+        return by_odometry if self._is_valid else guess
 
     def detect(
         self,
@@ -191,7 +154,6 @@ class OdometryFaults:
         match: ScanMatch,
         usual: float | None,
         *,
-        is_odometry: bool,
         may_stand: bool,
     ) -> Fault | None:
         """The fault that the scan shows to which the motion was predicted.
@@ -201,56 +163,50 @@ class OdometryFaults:
             scan: its hits.
             pose: (3, 3) T_map_base of the scan before.
             match: by the prior.
-            usual: recent average of the explained share; None: whether the robot stands is not
-                tested, for the scans contradict the map.
-            is_odometry: the prior is that of odometry.
+            usual: recent average of the explained share; None: nothing is tested, for the scans
+                contradict the map.
             may_stand: if it does, that is believed now: what keeps its place is not people.
         """
-        guess, increment = self._guess, self.increment
-        slip = self._slip.detect(self._count, pose, guess, increment, grid, scan, match)
-        if slip is not None:
-            back = min(self._count - slip.first, len(self._stamps))
-            # the velocity is that of the hypothesis, too
-            before = [slip.before, *(step.T_map_base for step in slip.matches)][-2]
-            self._standing.reset()
-            return Fault(self._stamps[-back] if back else None, before, slip.matches[-1])
-        if increment is None:
+        if self.increment is None or not len(scan.points):
+            self.reset()
             return None
-        if self._stands:
-            by_odometry = motion_model.odometry_prior(pose, increment, self._options)
-            self._stands = is_inconsistent(by_odometry, match.T_map_base)
+        by_odometry = motion_model.odometry_prior(pose, self.increment, self._options)
+        if match.contradicts_odometry:
+            self._is_valid = False
+        elif not self._is_valid:
+            self._is_valid = by_odometry.cost(match.T_map_base) < self._guess.cost(match.T_map_base)
+        if not self._is_valid or usual is None:
+            self._rival = None
             return None
-        is_tested = is_odometry and not match.contradicts_odometry and len(scan.points) > 0
-        if usual is None or not is_tested:
+        rival = self._rival = self._choose_rival(pose)
+        std = self._guess.translation_std, self._guess.rotation_std
+        fault = rival.observe(grid, scan, match.T_map_base, std)
+        if rival.gain < -FAULT_COST:
+            self._rival = None
+        if fault is None or (rival.stands and not may_stand):
             return None
-        standing = self._standing.observe(grid, scan, pose, match.T_map_base, increment, self._ns)
-        return self._accept_standing(standing, usual) if may_stand else None
+        self._rival = None
+        if is_poor(fault.match, usual):  # the robot is elsewhere
+            return None
+        self._is_valid = False
+        return fault
 
-    def advance(self, ns: int) -> None:
-        """The scan with that stamp is registered."""
-        self._stamps.append(ns)
-        self._count += 1
-
-    def reset(self) -> None:
-        """Discard the past motion, after the robot was carried elsewhere."""
-        self._slip.reset()
-        self._standing.reset()
-        self._stands = False
-
-    def _accept_standing(self, standing: ScanMatch | None, usual: float) -> Fault | None:
-        if standing is None:
-            return None
-        first_ns = self._standing.first_ns
-        self._standing.reset()
-        if is_poor(standing, usual):  # the robot is elsewhere
-            return None
-        self._stands = True
-        return Fault(first_ns, standing.T_map_base, standing)
+    def _choose_rival(self, pose: Float) -> RivalMotion:
+        """The robot goes on while odometry stands still, and stands while odometry moves."""
+        assert self.increment is not None
+        onward = se2.inverse(pose) @ self._guess.T_map_base
+        if self._rival is not None and not self._rival.stands:
+            onward = self._rival.step
+        stands = _size(self.increment) > 0.5 * _size(onward)
+        if self._rival is not None and self._rival.stands == stands:
+            return self._rival
+        return RivalMotion(pose, np.eye(3) if stands else onward, self._ns, stands=stands)
 
 
-def _is_plausible(step: Float, seconds: float) -> bool:
-    """True if a robot can move by a step (3, 3) in that time."""
-    return float(np.hypot(*step[:2, 2])) <= max(_LEAP, _MAX_SPEED * seconds)
+def _size(step: Float) -> float:
+    """m and rad of a step (3, 3) together."""
+    x, y, theta = se2.parameters(step)
+    return float(np.hypot(x, y) + abs(theta))
 
 
 class DeadReckoning:

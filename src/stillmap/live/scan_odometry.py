@@ -154,7 +154,7 @@ class ScanOdometry:
             self._start_anew()
             match, is_slipping = accept_prior(prior), False
         elif not self._is_first:
-            fault = self._detect_fault(beams, scan, prior, match)
+            fault = self._detect_fault(beams, scan, match)
             if fault is not None:
                 front_end.pose, match = fault.before, fault.match
                 learned = self._learned_prior(prior, increment)  # the last pose has changed
@@ -266,7 +266,7 @@ class ScanOdometry:
         return accept_prior(prior)
 
     def _detect_fault(
-        self, beams: ScanBeams, scan: Scan, prior: MotionPrior, match: ScanMatch
+        self, beams: ScanBeams, scan: Scan, match: ScanMatch
     ) -> Fault | None:
         """The fault of odometry, if any; scans since it began are removed from the local map."""
         has_map = self.local_map.has_sensor(beams.sensor) and not self._is_contradicted
@@ -276,10 +276,9 @@ class ScanOdometry:
             self._front_end.pose,
             match,
             self._front_end.usual.get(beams.sensor) if has_map else None,
-            is_odometry=prior.is_odometry,
             may_stand=not (self.crowd.walks_along or self.crowd.may_walk_along),
         )
-        if fault is not None and fault.first_ns is not None:
+        if fault is not None:
             self.local_map.remove_since(fault.first_ns)
         return fault
 
@@ -323,4 +322,3 @@ class ScanOdometry:
         metres = self._front_end.advance(T, is_first=self._is_first)
         self.travelled += 0.0 if self._is_first else metres
         self._stamp_ns, self._is_first = beams.stamp_ns, False
-        self._faults.advance(beams.stamp_ns)
