@@ -125,6 +125,7 @@ class OdometryFaults:
         """Discard the past motion, after the robot was carried elsewhere."""
         self._is_valid = True
         self._rival: RivalMotion | None = None
+        self._doubtful: tuple[Float, Float] | None = None
 
     def predict(
         self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
@@ -170,18 +171,17 @@ class OdometryFaults:
         if self.increment is None or not len(scan.points):
             self.reset()
             return None
-        by_odometry = motion_model.odometry_prior(pose, self.increment, self._options)
         if match.contradicts_odometry:
             self._is_valid = False
         elif not self._is_valid:
-            self._is_valid = by_odometry.cost(match.T_map_base) < self._guess.cost(match.T_map_base)
+            self._is_valid = self._agrees(pose, match.T_map_base)
         if not self._is_valid or usual is None:
             self._rival = None
             return None
         rival = self._rival = self._choose_rival(pose)
         std = self._guess.translation_std, self._guess.rotation_std
         fault = rival.observe(grid, scan, match.T_map_base, std)
-        if rival.gain < -FAULT_COST:
+        if rival.gain < 0.0:
             self._rival = None
         if fault is None or (rival.stands and not may_stand):
             return None
@@ -190,6 +190,18 @@ class OdometryFaults:
             return None
         self._is_valid = False
         return fault
+
+    def _agrees(self, pose: Float, T_map_base: Float) -> bool:
+        """True if the robot moved on, and as odometry says that was at fault."""
+        assert self.increment is not None
+        start, step = self._doubtful or (pose, np.eye(3))
+        step = step @ self.increment
+        standing, moving = (
+            motion_model.odometry_prior(start, by, self._options) for by in (np.eye(3), step)
+        )
+        is_off = is_inconsistent(moving, T_map_base)
+        self._doubtful = None if is_off else (start, step)
+        return not is_off and is_inconsistent(standing, T_map_base)
 
     def _choose_rival(self, pose: Float) -> RivalMotion:
         """The robot goes on while odometry stands still, and stands while odometry moves."""

@@ -265,9 +265,7 @@ class ScanOdometry:
             front_end.weigh(beams.stamp_ns, prior.T_map_base, self._seconds_to(beams), evidence)
         return accept_prior(prior)
 
-    def _detect_fault(
-        self, beams: ScanBeams, scan: Scan, match: ScanMatch
-    ) -> Fault | None:
+    def _detect_fault(self, beams: ScanBeams, scan: Scan, match: ScanMatch) -> Fault | None:
         """The fault of odometry, if any; scans since it began are removed from the local map."""
         has_map = self.local_map.has_sensor(beams.sensor) and not self._is_contradicted
         fault = self._faults.detect(
