@@ -28,20 +28,16 @@ from stillmap.slam.scan_matching import (
     occluded_share,
     refine_pose,
     registration_cost,
-    search_pose,
+    search_within_prior,
 )
 
 _STANDING_STD = 0.005, 0.003  # m and rad by which a robot that stands may seem to move
-_MIN_STEP = 0.02  # m and rad: hypotheses that are closer to each other are not compared
-_LEAP, _MAX_SPEED = 1.0, 3.0  # m between two scans, and m/s, beyond which odometry has leaped
+_MAX_SPEED = 3.0  # m/s of robots: odometry that is faster has leaped
 
 # m and rad, standard deviations beyond which the search next to odometry may miss the pose
 _FAR = 0.05, 0.02
 # standard deviation of what odometry adds in every step alike: m per m, rad per m, rad per rad
 _BIAS = 0.03, 0.01, 0.02
-_WINDOW_STDS = 3.0  # half width of the search
-_MAX_ROTATION = math.pi / 2.0  # rad, half width
-_EXPLAINED = 0.7  # of the usual share, for a pose to be the right one
 _MAX_OCCLUDED = 0.4  # share of beams through walls at the pose by odometry: more contradict the map
 _ALIKE = 0.3, 0.3  # m and rad within which two optima are one pose
 # scans that see another part of the map, or are ambiguous, until odometry is believed
@@ -80,7 +76,7 @@ class RivalMotion:
         self.pose, self.step = pose, step
 
     def observe(
-        self, grid: _core.OccupancyGrid2D, scan: Scan, T: Float, std: tuple[float, float]
+        self, grid: _core.OccupancyGrid2D, scan: Scan, T: Float, guess: MotionPrior
     ) -> Fault | None:
         """Compare the pose of the next scan with that by odometry.
 
@@ -88,11 +84,10 @@ class RivalMotion:
             grid: the local map.
             scan: its hits, at least one.
             T: (3, 3) of the scan, by odometry and the map.
-            std: m and rad, of the motion at constant velocity.
+            guess: prior of constant velocity, for its standard deviations.
         """
-        prior = gaussian_prior(self.pose @ self.step, *(_STANDING_STD if self.stands else std))
-        if _size(se2.inverse(prior.T_map_base) @ T) < _MIN_STEP:
-            return None
+        std = _STANDING_STD if self.stands else (guess.translation_std, guess.rotation_std)
+        prior = gaussian_prior(self.pose @ self.step, *std)
         # labels that follow from the pose by odometry would leave out what contradicts it
         every = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
         match = refine_pose(grid, every, prior, prior.T_map_base)
@@ -142,7 +137,7 @@ class OdometryFaults:
         self.increment, self._guess, self._ns = increment, guess, ns
         if increment is None:
             return guess
-        if float(np.hypot(*increment[:2, 2])) > max(_LEAP, _MAX_SPEED * seconds):
+        if np.hypot(*increment[:2, 2]) > max(motion_model.MIN_LEAP, _MAX_SPEED * seconds):
             self._is_valid = False
         by_odometry = motion_model.odometry_prior(pose, increment, self._options)
         return by_odometry if self._is_valid else guess
@@ -153,8 +148,8 @@ class OdometryFaults:
         scan: Scan,
         pose: Float,
         match: ScanMatch,
-        usual: float | None,
         *,
+        has_map: bool,
         may_stand: bool,
     ) -> Fault | None:
         """The fault that the scan shows to which the motion was predicted.
@@ -164,8 +159,7 @@ class OdometryFaults:
             scan: its hits.
             pose: (3, 3) T_map_base of the scan before.
             match: by the prior.
-            usual: recent average of the explained share; None: nothing is tested, for the scans
-                contradict the map.
+            has_map: of the sensor, and scans agree with it; else they say nothing of the motion.
             may_stand: if it does, that is believed now: what keeps its place is not people.
         """
         if self.increment is None or not len(scan.points):
@@ -175,20 +169,16 @@ class OdometryFaults:
             self._is_valid = False
         elif not self._is_valid:
             self._is_valid = self._agrees(pose, match.T_map_base)
-        if not self._is_valid or usual is None:
+        if not self._is_valid or not has_map:
             self._rival = None
             return None
         rival = self._rival = self._choose_rival(pose)
-        std = self._guess.translation_std, self._guess.rotation_std
-        fault = rival.observe(grid, scan, match.T_map_base, std)
-        if rival.gain < 0.0:
+        fault = rival.observe(grid, scan, match.T_map_base, self._guess)
+        if rival.gain < 0.0:  # a fault that began later is likelier
             self._rival = None
         if fault is None or (rival.stands and not may_stand):
             return None
-        self._rival = None
-        if is_poor(fault.match, usual):  # the robot is elsewhere
-            return None
-        self._is_valid = False
+        self._rival, self._is_valid = None, False
         return fault
 
     def _agrees(self, pose: Float, T_map_base: Float) -> bool:
@@ -284,17 +274,16 @@ class DeadReckoning:
         wide = MotionPrior(prior.T_map_base, information, metres, radians)
         # labels at a pose that is wrong would take walls for people
         alike = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
-        window = _WINDOW_STDS * metres, min(_WINDOW_STDS * radians, _MAX_ROTATION)
-        match = search_pose(grid, alike, wide, *window)
+        match = search_within_prior(grid, alike, wide)
         evidence = judge_scan(grid, alike, match, usual)
         if evidence is Evidence.CONTRADICTS:
             occluded = occluded_share(grid, alike, prior.T_map_base)
             # odometry may have led the robot to where nothing is mapped
             evidence = Evidence.UNKNOWN if occluded <= _MAX_OCCLUDED else evidence
         if evidence is not Evidence.CONTRADICTS:
-            if match.explained >= _EXPLAINED * usual and not _is_ambiguous(match):
+            if not is_poor(match, usual) and not _is_ambiguous(match):
                 return match, Evidence.AGREES
-            self._unknown += match.explained < _EXPLAINED * usual
+            self._unknown += is_poor(match, usual)
         return None, evidence
 
     @property

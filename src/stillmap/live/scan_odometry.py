@@ -273,7 +273,7 @@ class ScanOdometry:
             scan,
             self._front_end.pose,
             match,
-            self._front_end.usual.get(beams.sensor) if has_map else None,
+            has_map=has_map,
             may_stand=not (self.crowd.walks_along or self.crowd.may_walk_along),
         )
         if fault is not None:

@@ -17,7 +17,7 @@ from stillmap.slam.options import OdometryOptions
 MIN_INCREMENT_STD = 0.02, 0.02  # m, rad: of an increment without motion
 _TRANSLATION_FLOOR, _ROTATION_FLOOR = MIN_INCREMENT_STD
 # odometry that restarts elsewhere leaps: beyond this many m and times the usual step
-_MIN_LEAP, _LEAP_RATIO = 1.0, 5.0
+MIN_LEAP, _LEAP_RATIO = 1.0, 5.0
 _FAULT_STDS = 3.0  # of the options, beyond which an increment is at fault
 # constant-velocity model: std before any residual is known (m, rad), weight of the last residual
 _INITIAL_TRANSLATION, _INITIAL_ROTATION, _FORGETTING = 0.5, 0.5, 0.1
@@ -214,7 +214,7 @@ def compute_odometry_steps(T_odom_base: Float, stamp_ns: Int64) -> OdometrySteps
     seconds = 1e-9 * np.diff(stamp_ns)
     seconds = np.maximum(seconds, max(float(np.median(seconds)), 1e-9))
     usual = float(np.quantile(metres / seconds, 0.95))
-    limit = np.maximum(_MIN_LEAP, _LEAP_RATIO * usual * seconds)
+    limit = np.maximum(MIN_LEAP, _LEAP_RATIO * usual * seconds)
     return OdometrySteps(increments, metres <= limit)
 
 

@@ -155,7 +155,7 @@ def widen_match(
         if mean is None or match.explained >= threshold:
             continue
         wide = motion_model.widen_prior(mean, *(half / _SEARCH_STDS for half in window))
-        wider = _search_window(grid, scan, wide)
+        wider = search_within_prior(grid, scan, wide)
         cost_of_fault = wider.cost + motion_cost(wide, wider) + FAULT_COST
         # at a place that only looks alike, beams would pass through walls
         is_alike = occluded_share(grid, scan, wider.T_map_base) > MAX_OCCLUDED
@@ -190,15 +190,15 @@ def _match_within_prior(
 ) -> ScanMatch:
     """The best pose within the prior's window; the optimum next to odometry if good enough."""
     if not prior.is_odometry:
-        return _search_window(grid, scan, prior)
+        return search_within_prior(grid, scan, prior)
     local = refine_pose(grid, scan, prior, prior.T_map_base)
     if local.explained >= LOCAL_SHARE * usual:
         return local
-    matches = local, _search_window(grid, scan, prior)
+    matches = local, search_within_prior(grid, scan, prior)
     return min(matches, key=lambda match: match.cost + motion_cost(prior, match))
 
 
-def _search_window(grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior) -> ScanMatch:
+def search_within_prior(grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior) -> ScanMatch:
     """The best pose in the window of a prior."""
     stds = prior.translation_std, prior.rotation_std
     return search_pose(grid, scan, prior, *(_SEARCH_STDS * std for std in stds))
