@@ -162,17 +162,18 @@ class OdometryFaults:
             has_map: of the sensor, and scans agree with it; else they say nothing of the motion.
             may_stand: if it does, that is believed now: what keeps its place is not people.
         """
-        if self.increment is None or not len(scan.points):
+        increment = self.increment
+        if increment is None or not len(scan.points):
             self.reset()
             return None
         if match.contradicts_odometry:
             self._is_valid = False
         elif not self._is_valid:
-            self._is_valid = self._agrees(pose, match.T_map_base)
+            self._is_valid = self._agrees(pose, increment, match.T_map_base)
         if not self._is_valid or not has_map:
             self._rival = None
             return None
-        rival = self._rival = self._choose_rival(pose)
+        rival = self._rival = self._choose_rival(pose, increment)
         fault = rival.observe(grid, scan, match.T_map_base, self._guess)
         if rival.gain < 0.0:  # a fault that began later is likelier
             self._rival = None
@@ -181,27 +182,26 @@ class OdometryFaults:
         self._rival, self._is_valid = None, False
         return fault
 
-    def _agrees(self, pose: Float, T_map_base: Float) -> bool:
+    def _agrees(self, pose: Float, increment: Float, T_map_base: Float) -> bool:
         """True if the robot moved on, and as odometry says that was at fault."""
-        assert self.increment is not None
         start, step = self._doubtful or (pose, np.eye(3))
-        step = step @ self.increment
-        standing, moving = (
-            motion_model.odometry_prior(start, by, self._options) for by in (np.eye(3), step)
-        )
-        is_off = is_inconsistent(moving, T_map_base)
+        step = step @ increment
+        by_odometry = motion_model.odometry_prior(start, step, self._options)
+        standing = motion_model.odometry_prior(start, np.eye(3), self._options)
+        is_off = is_inconsistent(by_odometry, T_map_base)
         self._doubtful = None if is_off else (start, step)
+        # steps of a fast laser are too short to say so: they add up
         return not is_off and is_inconsistent(standing, T_map_base)
 
-    def _choose_rival(self, pose: Float) -> RivalMotion:
-        """The robot goes on while odometry stands still, and stands while odometry moves."""
-        assert self.increment is not None
+    def _choose_rival(self, pose: Float, increment: Float) -> RivalMotion:
+        """The robot stands while odometry moves, and goes on while odometry rather stands still."""
+        rival = self._rival
         onward = se2.inverse(pose) @ self._guess.T_map_base
-        if self._rival is not None and not self._rival.stands:
-            onward = self._rival.step
-        stands = _size(self.increment) > 0.5 * _size(onward)
-        if self._rival is not None and self._rival.stands == stands:
-            return self._rival
+        if rival is not None and not rival.stands:
+            onward = rival.step
+        stands = _size(increment) > 0.5 * _size(onward)
+        if rival is not None and rival.stands == stands:
+            return rival
         return RivalMotion(pose, np.eye(3) if stands else onward, self._ns, stands=stands)
 
 

@@ -19,11 +19,7 @@ from stillmap.slam.heading_alignment import DirectionDensity, Directions, Headin
 from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import Scan
-from stillmap.slam.scan_matching import (
-    ScanMatch,
-    accept_prior,
-    is_inconsistent,
-)
+from stillmap.slam.scan_matching import ScanMatch, accept_prior
 
 _MAX_REGISTERED = 600  # end points of a scan that are registered
 _KERNEL = np.radians(1.0)  # std of the normals about the direction of a wall
@@ -148,18 +144,18 @@ class ScanOdometry:
         scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams)
         front_end = self._front_end
         learned = self._learned_prior(prior, increment)
-        match, is_slipping = self._match(beams, scan, prior, learned)
-        is_carried = front_end.is_carried
+        match = self._match(beams, scan, prior, learned)
+        is_carried, is_slipping = front_end.is_carried, False
         if is_carried:
             self._start_anew()
-            match, is_slipping = accept_prior(prior), False
+            match = accept_prior(prior)
         elif not self._is_first:
+            is_rejected = increment is not None and not prior.is_odometry
+            is_slipping = match.contradicts_odometry or is_rejected
             fault = self._detect_fault(beams, scan, match)
             if fault is not None:
-                front_end.pose, match = fault.before, fault.match
+                front_end.pose, match, is_slipping = fault.before, fault.match, True
                 learned = self._learned_prior(prior, increment)  # the last pose has changed
-            is_rejected = increment is not None and not prior.is_odometry
-            is_slipping = is_slipping or fault is not None or is_rejected
         if not is_carried:
             match = self._correct_heading(scan, match)
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0 or self._is_adrift
@@ -229,14 +225,13 @@ class ScanOdometry:
 
     def _match(
         self, beams: ScanBeams, scan: Scan, prior: MotionPrior, learned: MotionPrior | None
-    ) -> tuple[ScanMatch, bool]:
-        """The match, and whether odometry slips."""
+    ) -> ScanMatch:
         self._is_adrift = False
         front_end, sensor, grid = self._front_end, beams.sensor, self.local_map.grid
         if not self.local_map.has_sensor(sensor) or not len(scan.points):
-            return accept_prior(learned or prior), False
+            return accept_prior(learned or prior)
         if self._reckoning.is_far and prior.is_odometry:
-            return self._find_again(beams, scan, learned or prior), False
+            return self._find_again(beams, scan, learned or prior)
         guess = front_end.predict() if prior.is_odometry else None
         match, poor = front_end.match(grid, scan, sensor, prior, learned, guess)
         evidence = Evidence.AGREES
@@ -245,8 +240,7 @@ class ScanOdometry:
             if match.explained < _NOTHING * front_end.usual.get(sensor, 1.0):
                 evidence = Evidence.CONTRADICTS
         front_end.weigh(beams.stamp_ns, match.T_map_base, self._seconds_to(beams), evidence)
-        is_outside = match.widened and is_inconsistent(prior, match.T_map_base)
-        return match, match.contradicts_odometry or (prior.is_odometry and is_outside)
+        return match
 
     def _find_again(self, beams: ScanBeams, scan: Scan, prior: MotionPrior) -> ScanMatch:
         """The match after a stretch in which no scan met anything."""
