@@ -8,6 +8,7 @@ import pytest
 from stillmap.core import se2
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
 
 FAULT = range(150, 200)  # 10 s
 
@@ -72,6 +73,21 @@ def test_odometry_that_stands_still(corridor, answers):
     updates = answers(lambda beams, _: (beams, T))
     assert any("slip" in updates[k].doubts for k in FAULT)
     assert error(corridor, updates, range(300)) < 0.3
+
+
+def test_odometry_that_stands_still_under_a_fast_laser():
+    changes = {"robot": {"scans": 600, "scan_rate": 20.0}}
+    simulation = simulate(scene_by_name("corridor", changes), 8)
+    odometry, updates = simulation.recording.T_odom_base.copy(), []
+    odometry[300:500] = odometry[299]
+    with LiveMapper({"threads": 1}) as mapper:
+        for beams, T_odom_base in zip(iter_beams(simulation.recording), odometry, strict=True):
+            updates.append(mapper.push(beams, T_odom_base))
+    slips = np.array(["slip" in update.doubts for update in updates])
+    assert slips[300:500].mean() > 0.7  # the robot stands, too
+    assert not slips[:300].any()
+    assert not slips[515:].any()
+    assert error(simulation, updates, range(600)) < 0.1
 
 
 def test_odometry_that_jumps(corridor, answers):

@@ -14,28 +14,35 @@ from stillmap.live.replay import iter_beams
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 
-FIRST, SPINNING, PERIOD_NS = 90, 20, 200_000_000
-STEP = se2.matrix(0.1, 0.0, 0.0)
+FIRST, SPINNING = 90, 20  # scans at 5 Hz
+SPEED = 0.5  # m/s of wheels that spin
 
 
-def spin(scene, changes):
-    """Scans, odometry and true poses of a robot that stands for some scans on its way."""
-    laser = {"max_range": 8.0, "fov": math.pi}
-    simulation = simulate(
-        scene_by_name(scene, {"robot": {"scans": 170}, "laser": laser, **changes}), 5
-    )
+def spin(scene, times=1):
+    """Scans, odometry and true poses of a robot that stands for some scans on its way.
+
+    The laser is so many times faster than 5 Hz.
+    """
+    rate, total, first = 5 * times, 170 * times, FIRST * times
+    changes = {
+        "robot": {"scans": total, "scan_rate": rate},
+        "laser": {"max_range": 8.0, "fov": math.pi},
+        "crowd": {"people": 0},
+    }
+    simulation = simulate(scene_by_name(scene, changes), 5)
+    step = se2.matrix(SPEED / rate, 0.0, 0.0)
     recording, rng = simulation.recording, np.random.default_rng(0)
     true, odometry = simulation.truth.T_world_base, recording.T_odom_base
     beams = list(iter_beams(recording))
-    order = [*range(FIRST), *[FIRST] * SPINNING, *range(FIRST + 1, 170)]
+    order = [*range(first), *[first] * SPINNING * times, *range(first + 1, total)]
     given, out = np.eye(3), []
     for n, k in enumerate(order):
-        is_spinning = FIRST < n < FIRST + SPINNING
+        is_spinning = first < n < first + SPINNING * times
         if n:
-            given = given @ (STEP if is_spinning else se2.inverse(odometry[k - 1]) @ odometry[k])
+            given = given @ (step if is_spinning else se2.inverse(odometry[k - 1]) @ odometry[k])
         noise = 0.002 * rng.normal(size=(len(beams[k].points), 1)) * is_spinning
         points = (beams[k].points * (1.0 + noise)).astype(np.float32)
-        out.append((replace(beams[k], points=points, stamp_ns=n * PERIOD_NS), given))
+        out.append((replace(beams[k], points=points, stamp_ns=n * 10**9 // rate), given))
     return out, true[order]
 
 
@@ -48,13 +55,25 @@ def follow(scans):
 
 @pytest.mark.parametrize("scene", ["office", "hall", "warehouse"])
 def test_wheels_that_spin_on_the_spot(scene):
-    scans, true = spin(scene, {"crowd": {"people": 0}})
+    scans, true = spin(scene)
     by_odometry = np.array([T for _, T in scans])
     assert compute_absolute_errors(by_odometry, true).rmse > 0.5
     poses, doubts = follow(scans)
     assert compute_absolute_errors(poses, true).rmse < 0.1
     assert sum("slip" in one for one in doubts[FIRST : FIRST + SPINNING + 5]) > SPINNING // 2
     assert not any("slip" in one for one in doubts[FIRST + SPINNING + 10 :])
+
+
+@pytest.mark.parametrize(("scene", "times"), [("hall", 2), ("office", 4), ("hall", 8)])
+def test_wheels_that_spin_between_scans_that_follow_fast(scene, times):
+    scans, true = spin(scene, times)
+    poses, doubts = follow(scans)
+    assert compute_absolute_errors(poses, true).rmse < 0.05
+    first, after = FIRST * times, (FIRST + SPINNING) * times
+    slips = ["slip" in of_scan for of_scan in doubts]
+    assert sum(slips[first:after]) > 0.7 * SPINNING * times
+    assert not any(slips[:first])
+    assert not any(slips[after + 3 * times :])
 
 
 @pytest.mark.parametrize("scene", ["office", "corridor"])
