@@ -8,8 +8,8 @@ import pytest
 from live_runs import answers, poses_of
 
 from stillmap.core import se2
+from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.odometry_faults import DeadReckoning
 from stillmap.live.replay import iter_beams
 from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate

@@ -8,8 +8,9 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
+from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan
-from stillmap.live.odometry_faults import DeadReckoning, Fault, OdometryFaults
+from stillmap.live.odometry_faults import Fault, OdometryFaults
 from stillmap.live.registration import Crowd, Registration
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.slam import motion_model, scan_hits
