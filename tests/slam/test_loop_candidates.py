@@ -87,7 +87,7 @@ def test_stages_cover_all_keyframes(n):
 
 def test_consistency_by_stages_equals_consistency_at_once():
     context = laps(2)
-    chain = odometry_constraints(context, OPTIONS.odometry, [])
+    chain = odometry_constraints(context, [])
     rng = np.random.default_rng(3)
     shifts = rng.choice([0.2, 0.2, -0.3], 21)
     found = [tie(k, 21 + k, T=se2.matrix(shift, 0.0, 0.0)) for k, shift in enumerate(shifts)]

@@ -120,7 +120,7 @@ class LoopCloser:
         self._searched_until = float(context.travelled[-1])
         self._poses = _extend(self._poses, self._T_map_local, context.poses)
         self._reported = _extend(self._reported, self._reported_T_map_local, context.poses)
-        chain = loop_candidates.odometry_constraints(context, self._options.odometry, [])
+        chain = loop_candidates.odometry_constraints(context, [])
         new = context.keyframes[first:]
         self._centers = np.concatenate(
             [self._centers, loop_candidates.view_centers(replace(context, keyframes=new))]

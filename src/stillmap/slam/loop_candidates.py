@@ -8,9 +8,6 @@ import numpy as np
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float
-from stillmap.core.recording import Recording
-from stillmap.slam import motion_model
-from stillmap.slam.options import OdometryOptions
 from stillmap.slam.pose_graph import Constraint
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
@@ -23,7 +20,6 @@ _DRIFT_TRANSLATION, DRIFT_ROTATION = 0.006, 0.0003
 _MIN_DRIFT, _MAX_DRIFT_TRAVEL = (0.1, 0.02), 1000.0
 _STEP_TRANSLATION, _STEP_ROTATION = 0.03, 0.004  # random walk, m and rad per root of a metre
 NO_ODOMETRY = [1e3, 1e3, 10.0]  # m, m, rad: std of a step across a break
-_LEAP_STDS = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
 
 
 def drift_std(metres: float) -> tuple[float, float]:
@@ -158,25 +154,17 @@ def propose_candidates(
                 break
 
 
-def odometry_constraints(
-    context: LoopContext, options: OdometryOptions, breaks: list[int]
-) -> list[Constraint]:
+def odometry_constraints(context: LoopContext, breaks: list[int]) -> list[Constraint]:
     """Constraints between successive keyframes, indexed by keyframe.
 
-    Their covariance is that of a random walk, half as wide across as along the motion. Where
-    odometry contradicts the poses by a leap, the difference is added. A step across a break is
-    unconstrained.
+    Their covariance is that of a random walk, half as wide across as along the motion. A
+    step across a break is unconstrained.
     """
     keyframes, poses = context.keyframes, context.poses
-    leaps = _find_leaps(context.recording, poses, options)
     chain = []
     for k, (i, j) in enumerate(itertools.pairwise(keyframes)):
         T = se2.inverse(poses[i]) @ poses[j]
         covariance = _step_covariance(T, float(context.travelled[j] - context.travelled[i]))
-        for t in range(i + 1, j + 1):
-            if leaps[t].any():
-                to_j = se2.inverse(poses[j]) @ poses[t]
-                covariance += se2.rotate_covariance(np.outer(leaps[t], leaps[t]), to_j)
         back = se2.inverse(poses[j])
         covariance += se2.rotate_covariance(context.drift[i + 1 : j + 1].sum(axis=0), back)
         if j in breaks:
@@ -190,17 +178,3 @@ def _step_covariance(T: Float, metres: float) -> Float:
     root = np.sqrt(metres + abs(float(se2.parameters(T)[2])) + 0.05)
     xy, theta = _STEP_TRANSLATION * root, _STEP_ROTATION * root
     return np.diag([xy**2, (0.5 * xy) ** 2, theta**2])
-
-
-def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) -> Float:
-    """(T, 3) difference of the motion to each scan from odometry; 0 where it is plausible."""
-    leaps = np.zeros((len(poses), 3))
-    if recording.T_odom_base is None:
-        return leaps
-    increments = se2.increments(recording.T_odom_base)
-    matched = se2.increments(poses)
-    difference = se2.parameters(se2.inverse(increments) @ matched)
-    std = motion_model.increment_std(increments, options)[:, [0, 0, 1]]
-    is_leap = np.linalg.norm(difference / std, axis=1) > _LEAP_STDS
-    leaps[1:][is_leap] = difference[is_leap]
-    return leaps

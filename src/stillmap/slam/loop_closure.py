@@ -71,7 +71,7 @@ def close_loops(
     tied = [t for tie in ties for t in (tie.earlier, tie.later)]
     starts = odometry.diagnostics.segments
     context = _make_context(recording, e, options, odometry, starts, tied)
-    chain = loop_candidates.odometry_constraints(context, options.odometry, breaks)
+    chain = loop_candidates.odometry_constraints(context, breaks)
     state = LoopState(context.poses[context.keyframes], found=ties, fitting=ties)
     centers = loop_candidates.view_centers(context)
     for first, last in loop_candidates.split_stages(context):
