@@ -53,27 +53,19 @@ def follow(scans):
     return poses_of(updates), [one.doubts for one in updates]
 
 
-@pytest.mark.parametrize("scene", ["office", "hall", "warehouse"])
-def test_wheels_that_spin_on_the_spot(scene):
-    scans, true = spin(scene)
-    by_odometry = np.array([T for _, T in scans])
-    assert compute_absolute_errors(by_odometry, true).rmse > 0.5
-    poses, doubts = follow(scans)
-    assert compute_absolute_errors(poses, true).rmse < 0.1
-    assert sum("slip" in one for one in doubts[FIRST : FIRST + SPINNING + 5]) > SPINNING // 2
-    assert not any("slip" in one for one in doubts[FIRST + SPINNING + 10 :])
+SCENES = [("office", 1), ("hall", 1), ("warehouse", 1), ("hall", 2), ("office", 4), ("hall", 8)]
 
 
-@pytest.mark.parametrize(("scene", "times"), [("hall", 2), ("office", 4), ("hall", 8)])
-def test_wheels_that_spin_between_scans_that_follow_fast(scene, times):
+@pytest.mark.parametrize(("scene", "times"), SCENES)
+def test_wheels_that_spin_on_the_spot(scene, times):
     scans, true = spin(scene, times)
+    assert compute_absolute_errors(np.array([T for _, T in scans]), true).rmse > 0.5
     poses, doubts = follow(scans)
     assert compute_absolute_errors(poses, true).rmse < 0.05
-    first, after = FIRST * times, (FIRST + SPINNING) * times
-    slips = ["slip" in of_scan for of_scan in doubts]
-    assert sum(slips[first:after]) > 0.7 * SPINNING * times
-    assert not any(slips[:first])
-    assert not any(slips[after + 3 * times :])
+    slips = np.array(["slip" in of_scan for of_scan in doubts])
+    assert slips[FIRST * times : (FIRST + SPINNING) * times].mean() > 0.7
+    assert not slips[: FIRST * times].any()
+    assert not slips[(FIRST + SPINNING + 3) * times :].any()
 
 
 @pytest.mark.parametrize("scene", ["office", "corridor"])
