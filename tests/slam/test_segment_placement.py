@@ -41,6 +41,7 @@ def test_evidence_prefers_the_right_place():
     first, last = halfway(context), len(context.poses)
     right = Segment(context, first, last, NARROW).follow_odometry()
     assert right.is_likely
+    assert right.cost < 20.0  # however many keyframes follow the first one
     shifted = moved(context, first, 0.2, -0.2, 0.03)
     followed = Segment(shifted, first, last, NARROW).follow_odometry()
     np.testing.assert_allclose(followed.C @ shifted.poses[first], context.poses[first], atol=0.03)

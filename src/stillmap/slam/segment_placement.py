@@ -127,11 +127,13 @@ class Segment:
                 usual = float(context.explained[t])
                 match = scan_matching.match_scan(self._map, scan, prior, usual)
                 if match.explained >= loop_verification.MIN_EXPLAINED:
-                    poses[t] = match.T_map_base
-                    cost += scan_matching.motion_cost(prior, match)
-                    moved = match.T_map_base @ se2.inverse(context.poses[t])
-                    spread = np.zeros((3, 3))
-                    C_first = moved if C_first is None else C_first
+                    poses[t] = T = match.T_map_base
+                    moved, spread = T @ se2.inverse(context.poses[t]), np.zeros((3, 3))
+                    if C_first is None:
+                        C_first = moved
+                        cost += scan_matching.motion_cost(prior, match)
+                    else:  # its prior is as wide in an unknown place
+                        cost += prior.cost(T)
         own = context.count_beams(self._tested, np.array([poses[t] for t in self._tested]))
         gain = same_place_evidence(self._counts, own)
         return Placement(C if C_first is None else C_first, C_first is not None, gain, cost)
