@@ -68,6 +68,15 @@ def test_wheels_that_spin_on_the_spot(scene, times):
     assert not slips[(FIRST + SPINNING + 3) * times :].any()
 
 
+@pytest.mark.parametrize("scene", ["office", "corridor"])
+def test_a_robot_that_drives_on_does_not_stand(scene):
+    laser = {"max_range": 8.0, "fov": math.pi}
+    simulation = simulate(scene_by_name(scene, {"robot": {"scans": 170}, "laser": laser}), 6)
+    recording = simulation.recording
+    assert recording.T_odom_base is not None
+    assert not any("slip" in one.doubts for one in answers(recording))
+
+
 def test_an_error_of_the_heading_grows_with_the_way():
     """Against many runs with a heading that is off from the start."""
     reckoning, rng = DeadReckoning(), np.random.default_rng(0)

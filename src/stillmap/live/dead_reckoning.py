@@ -1,4 +1,4 @@
-"""Where odometry alone may have led the robot, and the search for it there."""
+"""Dead reckoning while scans have no returns: covariance of the pose, and the search after it."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ _MAX_UNKNOWN, _MAX_SCANS = 10, 100
 
 
 class DeadReckoning:
-    """The uncertainty of the pose since the last scan that met anything."""
+    """Covariance of the pose by odometry alone since the last scan with returns."""
 
     def __init__(self) -> None:
         self.reset()
@@ -91,11 +91,11 @@ class DeadReckoning:
         information = np.asarray(np.linalg.inv(covariance), np.float64)
         wide = MotionPrior(prior.T_map_base, information, metres, radians)
         # labels at a pose that is wrong would take walls for people
-        alike = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
-        match = search_within_prior(grid, alike, wide)
-        evidence = judge_scan(grid, alike, match, usual)
+        unlabelled = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
+        match = search_within_prior(grid, unlabelled, wide)
+        evidence = judge_scan(grid, unlabelled, match, usual)
         if evidence is Evidence.CONTRADICTS:
-            occluded = occluded_share(grid, alike, prior.T_map_base)
+            occluded = occluded_share(grid, unlabelled, prior.T_map_base)
             # odometry may have led the robot to where nothing is mapped
             evidence = Evidence.UNKNOWN if occluded <= _MAX_OCCLUDED else evidence
         if evidence is not Evidence.CONTRADICTS:

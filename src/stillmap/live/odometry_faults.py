@@ -74,11 +74,13 @@ class RivalMotion:
         std = _STANDING_STD if self.stands else (guess.translation_std, guess.rotation_std)
         prior = gaussian_prior(self.pose @ self.step, *std)
         # labels that follow from the pose by odometry would leave out what contradicts it
-        every = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
-        match = refine_pose(grid, every, prior, prior.T_map_base)
+        unlabelled = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
+        match = refine_pose(grid, unlabelled, prior, prior.T_map_base)
         # by end points alone: the local map is smeared along a motion that was none, and beams of
         # a robot that stands seem to pass through it
-        by_odometry, by_rival = (registration_cost(grid, every, at) for at in (T, match.T_map_base))
+        by_odometry, by_rival = (
+            registration_cost(grid, unlabelled, at) for at in (T, match.T_map_base)
+        )
         self.gain += by_odometry - by_rival
         before, self.pose = self.pose, match.T_map_base
         if not self.stands:
@@ -105,7 +107,7 @@ class OdometryFaults:
         """Discard the past motion, after the robot was carried elsewhere."""
         self._is_valid = True
         self._rival: RivalMotion | None = None
-        self._doubtful: tuple[Float, Float] | None = None
+        self._unconfirmed: tuple[Float, Float] | None = None
 
     def predict(
         self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
@@ -169,12 +171,12 @@ class OdometryFaults:
 
     def _agrees(self, pose: Float, increment: Float, T_map_base: Float) -> bool:
         """True if the robot moved on, and as odometry says that was at fault."""
-        start, step = self._doubtful or (pose, np.eye(3))
+        start, step = self._unconfirmed or (pose, np.eye(3))
         step = step @ increment
         by_odometry = motion_model.odometry_prior(start, step, self._options)
         standing = motion_model.odometry_prior(start, np.eye(3), self._options)
         is_off = is_inconsistent(by_odometry, T_map_base)
-        self._doubtful = None if is_off else (start, step)
+        self._unconfirmed = None if is_off else (start, step)
         # steps of a fast laser are too short to say so: they add up
         return not is_off and is_inconsistent(standing, T_map_base)
 
@@ -184,7 +186,7 @@ class OdometryFaults:
         onward = se2.inverse(pose) @ self._guess.T_map_base
         if rival is not None and not rival.stands:
             onward = rival.step
-        stands = _size(increment) > 0.5 * _size(onward)
+        stands = _size(increment) > 0.5 * _size(onward)  # nearer to that step than to none
         if rival is not None and rival.stands == stands:
             return rival
         return RivalMotion(pose, np.eye(3) if stands else onward, self._ns, stands=stands)
