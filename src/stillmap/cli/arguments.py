@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core import config
-from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.errors import InputError, explaining_refusal
 
 if TYPE_CHECKING:
     from stillmap.pipeline.options import Options
@@ -221,14 +221,12 @@ def make_parents(output: Path) -> Iterator[None]:
     parent = resolve_output(output).parent
     created = [folder for folder in (parent, *parent.parents) if not folder.exists()]
     try:
-        try:
+        with explaining_refusal(output):
             parent.mkdir(parents=True, exist_ok=True)
             # the writer reports a device at this path
             if not output.exists() or output.is_file() or output.is_dir():
                 with temporary_folder(output):
                     pass
-        except OSError as error:
-            raise cannot_write(error, output) from error
         yield
     except BaseException:
         with suppress(OSError):  # not empty

@@ -1,7 +1,8 @@
 """InputError, the one exception for invalid input or calls, and import of optional libraries."""
 
 import errno
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -58,9 +59,34 @@ class InputError(Exception):
         return printable(f"{place}{self.what}{advice}".replace("\n", " "))
 
 
-def cannot_write(error: OSError, path: object) -> InputError:
-    """The error of an output that the system refuses to write."""
-    return InputError(f"cannot be written: {error.strerror or error}", where=str(path))
+@contextmanager
+def explaining_refusal(path: object) -> Iterator[None]:
+    """Within this context, what the system refuses to write is an error of the output `path`.
+
+    Raises:
+        InputError: it refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        what = f"cannot be written: {error.strerror or error}"
+        raise InputError(what, where=str(path)) from error
+
+
+@contextmanager
+def explaining_damage(
+    path: object, *kinds: type[Exception], what: str = "is damaged", hint: str = ""
+) -> Iterator[None]:
+    """Within this context, errors of these kinds, and any ValueError, are those of a damaged file.
+
+    Raises:
+        InputError: such an error occurred; `what` stands before its text.
+    """
+    expected: tuple[type[Exception], ...] = (ValueError, *kinds)
+    try:
+        yield
+    except expected as error:
+        raise InputError(f"{what}: {error}", where=str(path), hint=hint) from error
 
 
 def _truncate(text: str) -> str:

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
-from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.errors import InputError, explaining_refusal
 from stillmap.core.interrupts import defer_signals
 
 PREFIX = ".stillmap."  # of hidden names inside an output
@@ -38,11 +38,9 @@ def resolve_output(path: Path) -> Path:
         InputError: links lead to each other, or no file can have such a name there.
     """
     target = Path(os.path.realpath(path))
-    try:
+    with explaining_refusal(path):
         if target.is_symlink():
             raise InputError("is a link that leads to itself", where=str(path))
-    except OSError as error:
-        raise cannot_write(error, path) from error
     return target
 
 
@@ -197,14 +195,13 @@ def _naming_output(work: Path, output: Path) -> Iterator[None]:
         InputError: likewise where the system refuses to write.
     """
     try:
-        yield
+        with explaining_refusal(output):
+            yield
     except InputError as error:
         if not error.where.startswith(str(work)):
             raise
         where = f"{output}{error.where.removeprefix(str(work))}"
         raise InputError(error.what, where=where, hint=error.hint) from error
-    except OSError as error:
-        raise cannot_write(error, output) from error
 
 
 def to_encodable(text: str) -> str:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stillmap.core.errors import InputError, cannot_write, import_extra
+from stillmap.core.errors import InputError, explaining_refusal, import_extra
 from stillmap.core.files import atomic_file, package_version, resolve_output, to_encodable
 from stillmap.core.input_files import hold_lock
 from stillmap.core.json import to_json
@@ -161,10 +161,8 @@ def _hold_output(root: str) -> Iterator[None]:
         yield
         return
     lock = Path(path, _LOCK)
-    try:
+    with explaining_refusal(root):
         file = hold_lock(lock, "another fleet is writing there", root)
-    except OSError as error:
-        raise cannot_write(error, root) from error
     with file:
         try:
             yield

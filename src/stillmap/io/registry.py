@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.recording import Recording
 from stillmap.io import rgbd, stillmap_folder
 from stillmap.io.builder import ReadContext
@@ -126,10 +126,8 @@ def detect_format(path: Path) -> Format:
     Raises:
         InputError: there is nothing, or no recording.
     """
-    try:
+    with explaining_damage(repr(str(path)), OSError, what="is no usable path"):
         is_folder, is_file = path.is_dir(), path.is_file()
-    except (OSError, ValueError) as error:
-        raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
     if not is_folder and not is_file:
         what = "is no regular file" if path.exists() else "does not exist"
         raise InputError(what, where=str(path))

@@ -25,7 +25,7 @@ from stillmap.core.array_folder import (
 from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.camera import Camera, Images
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
@@ -192,7 +192,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
         raise _damaged_error(path, "stamp_ns", "stamps decrease")
     _check_points(path, points, hit)
-    try:
+    with explaining_damage(path):
         return Recording(
             stamp_ns=np.array(stamp_ns),
             offset=np.array(offset),
@@ -206,8 +206,6 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
             T_recorded_base=load_poses("T_recorded_base", T) if header.recorded_poses else None,
             images=_read_images(path, header),
         )
-    except ValueError as error:
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
 def _count_whole_scans(path: Path, header: _Header) -> _Header:

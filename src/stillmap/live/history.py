@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from stillmap.core.array_builder import GrowingArray
 from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.array_types import Float, Float32
-from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.errors import InputError, explaining_refusal
 from stillmap.core.recording import Recording
 from stillmap.core.source import LaserPose, SensorNotes, Source
 from stillmap.io.stillmap_folder import FORMAT, HEADER
@@ -226,13 +226,11 @@ class History(GrowingRecording):
         self._is_full, pose = False, (dimension + 1,) * 2
         notes = [("pose", np.float64, pose), ("local", np.float64, pose), ("anchor", np.int64)]
         dtype = np.dtype([*notes, ("twist", np.float64, 3 * (dimension - 1))], align=True)
-        try:
+        with explaining_refusal(folder or scratch or ""):
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
             super().__init__(dimension, dtype, folder, scratch)
-        except OSError as error:
-            raise cannot_write(error, folder or scratch or "") from error
 
     def append(
         self, beams: ScanBeams, label: Float32, T_odom_base: Float | None = None, **notes: Any

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.arrays import write_npy
-from stillmap.core.errors import advise, cannot_write
+from stillmap.core.errors import advise, explaining_refusal
 from stillmap.core.files import require_new, resolve_output
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
@@ -96,12 +96,11 @@ class Snapshot(ShortRepr):
             InputError: the folder is taken or cannot be written to.
         """
         try:
-            self._save(Path(path), overwrite, progress)
-        except BaseException as error:  # an interruption, too: nobody drives the same way again
+            with explaining_refusal(path):
+                self._save(Path(path), overwrite, progress)
+        except BaseException:  # an interruption, too: nobody drives the same way again
             if self.folder is not None:
                 _log.warning("the drive is kept: stillmap map %s makes a map of it", self.folder)
-            if isinstance(error, OSError):
-                raise cannot_write(error, path) from error
             raise
 
     def _save(self, path: Path, overwrite: bool, progress: Progress) -> None:

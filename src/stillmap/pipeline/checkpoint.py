@@ -23,7 +23,7 @@ from stillmap.core.array_folder import open_npy, read_record, write_arrays
 from stillmap.core.array_types import Float
 from stillmap.core.arrays import iter_bytes
 from stillmap.core.config import iter_options
-from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.errors import InputError, explaining_refusal
 from stillmap.core.files import hidden_path, package_version, remove, resolve_output
 from stillmap.core.input_files import hold_lock
 from stillmap.core.interrupts import defer_signals
@@ -134,11 +134,9 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     given, output = output, resolve_output(output)
     checkpoints = CheckpointFolder(hidden_path(output, "resume"))
     made = [path for path in output.parents if not path.exists()]
-    try:
+    with explaining_refusal(given):
         what = "another run is writing there"
         file = hold_lock(checkpoints.folder / _LOCK, what, str(given))
-    except OSError as error:
-        raise cannot_write(error, given) from error
     try:
         yield checkpoints
     finally:

@@ -14,7 +14,7 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Index
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.input_files import read_text
 from stillmap.io.trajectory import pose_rows, poses_from_rows
 from stillmap.slam import PoseGraph
@@ -94,11 +94,9 @@ def read_g2o(path: Path) -> PoseGraph:
             raise InputError(f"is damaged: {error}", where=f"{path}, line {number}") from error
     if not ids or np.any(np.diff(ids) <= 0):
         raise InputError("is damaged: vertices are missing or out of order", where=str(path))
-    try:
+    with explaining_damage(path, OverflowError, np.linalg.LinAlgError):
         keyframes, poses = np.array(ids, np.intp), _to_poses(np.array(rows))
         return PoseGraph(keyframes, poses, _to_constraints(keyframes, ends, edges, D))
-    except (ValueError, OverflowError, np.linalg.LinAlgError) as error:
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
 def _to_constraints(

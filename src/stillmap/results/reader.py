@@ -13,7 +13,7 @@ from stillmap.core import array_folder, se2
 from stillmap.core.array_folder import parse, read_array
 from stillmap.core.array_types import Bool, Float, Float32, Int64
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
@@ -223,11 +223,9 @@ def _read_layer(path: Path, name: str, kinds: str) -> tuple[NDArray[Any], Origin
     if layer.ndim != 2 or layer.dtype.kind not in kinds:
         hint = "maps are in the plane"
         raise InputError(f"{name} is {layer.shape} {layer.dtype}", where=str(path), hint=hint)
-    try:
+    with explaining_damage(path, TypeError):
         x, y, yaw = (float(value) for value in origin)
         resolution = float(edge)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
     inside = np.abs((x, y, yaw)) < MAX_TRANSLATION
     if not (inside.all() and _MIN_RESOLUTION < resolution < _MAX_RESOLUTION):
         raise InputError("origin or resolution is no usable number", where=str(path))
@@ -300,10 +298,8 @@ def read_tracks(path: Path) -> list[Track]:
     if not os.path.lexists(path):
         return []
     objects = parse(read_json(path, _MAX_OBJECTS), list[_Object], path)
-    try:
+    with explaining_damage(path):
         return [_to_track(one) for one in objects]
-    except ValueError as error:
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
 def _to_track(one: _Object) -> Track:

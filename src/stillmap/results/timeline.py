@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from stillmap.core.array_folder import parse, read_npz
 from stillmap.core.array_types import Bool, Float, Index, Int64
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
 from stillmap.results.reader import SESSIONS, Stamp
@@ -117,12 +117,10 @@ def read_sessions(folder: Path) -> list[PlaceSession]:
     """
     path = folder / SESSIONS
     entries = parse(read_json(path, _MAX_JSON, HINT), list[_SessionEntry], path, HINT)
-    try:
+    with explaining_damage(path, hint=HINT):
         if len({one.name for one in entries}) != len(entries):
             raise ValueError("two sessions have one name")
         return [_to_session(one) for one in entries]
-    except ValueError as error:
-        raise InputError(f"is damaged: {error}", where=str(path), hint=HINT) from error
 
 
 def _to_session(one: _SessionEntry) -> PlaceSession:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_folder import open_npy, read_npz, write_arrays
 from stillmap.core.array_types import Bool, Float, Float32, Int32, Int64
 from stillmap.core.arrays import write_npy, write_npz
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.json import read_json, write_json
 from stillmap.io.cameras import read_image, write_png
 from stillmap.io.trajectory import write_tum
@@ -68,11 +68,9 @@ def load_truth(path: str | Path) -> Truth:
     """
     folder = _find_folder(path, SCENE, "truth", "")
     names = (*ARRAYS, *(name for name in OPTIONAL if (folder / f"{name}.npy").exists()))
-    try:
+    with explaining_damage(folder, TypeError):
         arrays = {name: np.array(open_npy(folder / f"{name}.npy")) for name in names}
         return Truth(**arrays, scene=read_json(folder / SCENE, _MAX_SCENE))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"is damaged: {error}", where=str(folder)) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,7 @@ def load_image_truth(path: str | Path) -> ImageTruth:
         InputError: there is none, or it is damaged.
     """
     folder = _find_folder(path, STANDING, "truth about images", " with cameras")
-    try:
+    with explaining_damage(folder, TypeError, KeyError, OverflowError):
         of, moves = (read_npz(folder / name, None, _MAX_ARRAY) for name in (STANDING, MOVING))
         faces = Faces._make(of[f"faces_{field}"] for field in Faces._fields)
         solids = Solids._make(of[f"solids_{field}"] for field in Solids._fields)
@@ -112,8 +110,6 @@ def load_image_truth(path: str | Path) -> ImageTruth:
         parts = Solids(open_npy(folder / POSE), *(moves[name] for name in Solids._fields[1:]))
         moving = MovingSurfaces(moves["stamp_ns"], parts)
         T_world_camera = np.array(open_npy(folder / CAMERAS))
-    except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise InputError(f"is damaged: {error}", where=str(folder)) from error
     standing = StaticSurfaces(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
 
     def mask(image: int) -> NDArray[np.uint16]:

@@ -15,7 +15,7 @@ from xml.parsers import expat
 import numpy as np
 
 from stillmap.core.array_types import Float
-from stillmap.core.errors import InputError, MissingExtra, import_extra
+from stillmap.core.errors import InputError, MissingExtra, explaining_damage, import_extra
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
 from stillmap.core.timestamps import MAX_STAMP_NS
@@ -104,10 +104,8 @@ def _check_xml(path: Path) -> None:
     # other encodings could hide tags; the standard requires UTF-8
     if re.match(rb"(\xef\xbb\xbf)?\s*<\?xml[^>]*encoding=.utf-8", text, re.IGNORECASE) is None:
         raise InputError("is damaged: its XML section is not UTF-8", where=str(path))
-    try:
+    with explaining_damage(path, expat.ExpatError, what="is refused: its XML section"):
         _parse_xml(text)
-    except (ValueError, expat.ExpatError) as error:
-        raise InputError(f"is refused: its XML section: {error}", where=str(path)) from error
 
 
 def _parse_xml(text: bytes) -> None:

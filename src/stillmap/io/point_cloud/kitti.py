@@ -12,7 +12,7 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.core.array_types import Float
 from stillmap.core.camera import Camera, Images
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.files import atomic_folder
 from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
@@ -184,7 +184,7 @@ def _read_oxts(folder: Path) -> list[Float]:
         if not len(numbers):
             raise InputError("is empty", where=str(path))
         latitude, longitude, height, *angles = numbers[0]
-        try:
+        with explaining_damage(path):
             scale = scale or math.cos(math.radians(latitude))
             x = scale * _EARTH * math.radians(longitude)
             y = scale * _EARTH * math.log(math.tan(math.pi * (90.0 + latitude) / 360.0))
@@ -192,8 +192,6 @@ def _read_oxts(folder: Path) -> list[Float]:
             first = position if first is None else first
             R = Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
             out.append(rigid_transform(R, position - first))
-        except ValueError as error:
-            raise InputError(f"is damaged: {error}", where=str(path)) from error
     return out
 
 

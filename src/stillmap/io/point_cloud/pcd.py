@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
@@ -57,10 +57,8 @@ def read_header(path: Path) -> Header:
         raise InputError("is no PCD file", where=str(path))
     lines, start = table.split_header(path, head, lambda words: words[:1] == ["DATA"])
     entries = {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
-    try:
+    with explaining_damage(path, KeyError, IndexError, what="is damaged: its header"):
         return _parse_header(path, entries, start, len(lines))
-    except (ValueError, KeyError, IndexError) as error:
-        raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
 def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: int) -> Header:

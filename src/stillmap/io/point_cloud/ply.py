@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core.array_types import Float
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, explaining_damage
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.core.source import Source
@@ -56,10 +56,8 @@ def read_layout(path: Path) -> table.TableLayout:
     lines, start = table.split_header(path, head, lambda words: words == ["end_header"])
     if lines[0] != ["ply"]:
         raise InputError("is no PLY file", where=str(path))
-    try:
+    with explaining_damage(path, KeyError, IndexError, what="is damaged: its header"):
         return _parse_header(path, lines, start)
-    except (ValueError, KeyError, IndexError) as error:
-        raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
 def _parse_header(path: Path, lines: list[list[str]], header: int) -> table.TableLayout:
