@@ -127,7 +127,6 @@ def test_windows_and_tiles_equal_the_whole(printed, monkeypatch):
     whole = em.make_occupancy_map(grid, occupied)
     first = np.round(np.array(whole.origin[:2]) / RESOLUTION).astype(int)
     monkeypatch.setattr("stillmap.core.tiles.TILE", 7)
-    monkeypatch.setattr("stillmap.em.occupancy_grid.TILE", 7)
     again = em.make_occupancy_map(grid, occupied)
     box = em.GridWindow(first + np.array([20, -2]), (12, 15))
     part = em.make_occupancy_map(grid, occupied, window=box)

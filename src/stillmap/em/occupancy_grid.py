@@ -8,18 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 import stillmap._core as _core
+from stillmap.core import tiles
 from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.grid_map import GridMap
 from stillmap.core.square_box import SquareBox, bound_box
-from stillmap.core.tiles import (
-    TILE,
-    TILES_PER_RELEASE,
-    TiledArray,
-    compact,
-    crop,
-    release,
-    tiles_around,
-)
 from stillmap.em.types import CellProbabilities, Grid
 
 BLOCK_CELLS = 32  # edge of the blocks of the grid
@@ -37,7 +29,7 @@ class ObservedCells(NamedTuple):
     """
 
     first_cell: Int64
-    mask: TiledArray
+    mask: tiles.TiledArray
 
 
 class GridWindow(NamedTuple):
@@ -100,10 +92,10 @@ def make_occupancy_map(
         window = GridWindow(observed.first_cell, observed.mask.shape)
     if window is None:
         window = map_window(grid, places)
-    p_occupied = TiledArray(window.shape, np.float32, np.nan, scratch)
-    a, b = (TiledArray(window.shape, np.float32, 0.0, scratch) for _ in range(2))
+    p_occupied = tiles.TiledArray(window.shape, np.float32, np.nan, scratch)
+    a, b = (tiles.TiledArray(window.shape, np.float32, 0.0, scratch) for _ in range(2))
     for k, ((i, j), alpha, beta) in enumerate(_iter_tiles(grid, window)):
-        if k % TILES_PER_RELEASE == 0:
+        if k % tiles.TILES_PER_RELEASE == 0:
             for layer in (p_occupied, a, b):
                 layer.release()
         p_occupied.set_tile(i, j, _probabilities(alpha, beta, occupied))
@@ -113,11 +105,11 @@ def make_occupancy_map(
         _overlay(p_occupied, occupied, window.first_cell)
     if observed is not None:
         for block, p in p_occupied.tiles():
-            p[~crop(observed.mask, block)] = np.nan
+            p[~tiles.crop(observed.mask, block)] = np.nan
     x, y = (float(c) * grid.resolution for c in window.first_cell)
-    layers = compact(p_occupied), compact(a), compact(b)
+    layers = tiles.compact(p_occupied), tiles.compact(a), tiles.compact(b)
     for layer in layers:
-        release(layer)
+        tiles.release(layer)
     return OccupancyMap(layers[0], (x, y, 0.0), grid.resolution, *layers[1:])
 
 
@@ -126,7 +118,7 @@ def observed_cells(
 ) -> ObservedCells:
     """The cells of `map_window` that any beam of a grid crossed or ended in."""
     window = map_window(grid, places)
-    mask = TiledArray(window.shape, np.bool_, False, scratch)
+    mask = tiles.TiledArray(window.shape, np.bool_, False, scratch)
     for (i, j), alpha, beta in _iter_tiles(grid, window):
         mask.set_tile(i, j, alpha + beta > 0.0)
     return ObservedCells(window.first_cell, mask)
@@ -180,9 +172,9 @@ def _iter_tiles(
 ) -> Iterator[tuple[tuple[int, int], Float, Float]]:
     """Tiles with counts: row and column of the tile in the window, alpha, beta."""
     height, width = window.shape
-    for i, j in tiles_around(grid.block_cells - window.first_cell, BLOCK_CELLS, window.shape):
-        shape = min(TILE, height - i * TILE), min(TILE, width - j * TILE)
-        first = window.first_cell + TILE * np.array([j, i])
+    for i, j in tiles.tiles_around(grid.block_cells - window.first_cell, BLOCK_CELLS, window.shape):
+        shape = min(tiles.TILE, height - i * tiles.TILE), min(tiles.TILE, width - j * tiles.TILE)
+        first = window.first_cell + tiles.TILE * np.array([j, i])
         _, alpha, beta = grid.dense(first.tolist(), shape)
         if beta.any() or alpha.any():
             yield (i, j), alpha, beta
@@ -200,7 +192,7 @@ def _probabilities(alpha: Float, beta: Float, occupied: CellProbabilities | None
     return p
 
 
-def _overlay(p_occupied: TiledArray, occupied: CellProbabilities, first_cell: Int64) -> None:
+def _overlay(p_occupied: tiles.TiledArray, occupied: CellProbabilities, first_cell: Int64) -> None:
     """Adds surfaces to a map of passed cells, in place: p + (1 - p) * p_passed."""
     at = (occupied.cells - first_cell)[:, ::-1]
     inside = ((at >= 0) & (at < p_occupied.shape)).all(axis=1)

@@ -10,21 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core import tiles
 from stillmap.core.array_types import Bool, Float, Float32
 from stillmap.core.chunks import iter_beams
 from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.core.tiles import (
-    TILE,
-    TILES_PER_RELEASE,
-    TiledArray,
-    compact,
-    crop,
-    release,
-    tile_numbers,
-    tiles_around,
-)
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import BLOCK_CELLS, OccupancyMap
 from stillmap.em.options import EmOptions
@@ -97,28 +88,28 @@ def count_observations(
         used = counting_threads(len(hit), threads)
         counts.add(points, hit, is_dynamic, offset, T, time_bin[scans], used)
     layers = _dense_counts(counts, occupancy, recording.scratch)
-    observations, unobstructed, thin = map(compact, layers)
+    observations, unobstructed, thin = map(tiles.compact, layers)
     return Coverage(observations, unobstructed, thin, MIN_OBSERVATIONS, MOVER_RADIUS)
 
 
 def _dense_counts(
     counts: _core.ObservationCounts2D, occupancy: OccupancyMap, scratch: Path | None
-) -> tuple[TiledArray, TiledArray, TiledArray]:
+) -> tuple[tiles.TiledArray, tiles.TiledArray, tiles.TiledArray]:
     """Observations, unobstructed ones and thinly observed cells, laid out as the map."""
     first_cell, shape = occupancy.window
-    observations, unobstructed = (TiledArray(shape, np.uint16, 0, scratch) for _ in range(2))
-    thin = TiledArray(shape, np.bool_, False, scratch)
-    blocks = tiles_around(counts.block_cells - first_cell, BLOCK_CELLS, shape)
+    observations, unobstructed = (tiles.TiledArray(shape, np.uint16, 0, scratch) for _ in range(2))
+    thin = tiles.TiledArray(shape, np.bool_, False, scratch)
+    blocks = tiles.tiles_around(counts.block_cells - first_cell, BLOCK_CELLS, shape)
     layers = observations, unobstructed, thin, occupancy.p_occupied
-    for k, (i, j) in enumerate(sorted({*blocks, *tile_numbers(occupancy.p_occupied)})):
-        if k % TILES_PER_RELEASE == 0:
+    for k, (i, j) in enumerate(sorted({*blocks, *tiles.tile_numbers(occupancy.p_occupied)})):
+        if k % tiles.TILES_PER_RELEASE == 0:
             for layer in layers:
-                release(layer)
-        rows = slice(i * TILE, min((i + 1) * TILE, shape[0]))
-        columns = slice(j * TILE, min((j + 1) * TILE, shape[1]))
+                tiles.release(layer)
+        rows = slice(i * tiles.TILE, min((i + 1) * tiles.TILE, shape[0]))
+        columns = slice(j * tiles.TILE, min((j + 1) * tiles.TILE, shape[1]))
         first = (first_cell + np.array([columns.start, rows.start])).tolist()
         all_of, clear = counts.dense(first, (rows.stop - rows.start, columns.stop - columns.start))
-        p_occupied = crop(occupancy.p_occupied, (rows, columns))
+        p_occupied = tiles.crop(occupancy.p_occupied, (rows, columns))
         observations.set_tile(i, j, all_of)
         unobstructed.set_tile(i, j, clear)
         thin.set_tile(i, j, (clear < MIN_OBSERVATIONS) & ~np.isnan(p_occupied))

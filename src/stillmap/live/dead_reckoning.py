@@ -8,16 +8,10 @@ import numpy as np
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.array_types import Float
+from stillmap.slam import scan_matching
 from stillmap.slam.front_end import Evidence, judge_scan
 from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.scan_hits import Scan
-from stillmap.slam.scan_matching import (
-    MIN_GAIN,
-    ScanMatch,
-    is_poor,
-    occluded_share,
-    search_within_prior,
-)
 
 # m and rad, standard deviations beyond which the search next to odometry may miss the pose
 _FAR = 0.05, 0.02
@@ -73,7 +67,7 @@ class DeadReckoning:
         prior: MotionPrior,
         before: Float,
         usual: float,
-    ) -> tuple[ScanMatch | None, Evidence]:
+    ) -> tuple[scan_matching.ScanMatch | None, Evidence]:
         """The pose of the first scans after the stretch, if one explains a scan and no other does;
         and what the scan says of the map.
 
@@ -92,16 +86,16 @@ class DeadReckoning:
         wide = MotionPrior(prior.T_map_base, information, metres, radians)
         # labels at a pose that is wrong would take walls for people
         unlabelled = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
-        match = search_within_prior(grid, unlabelled, wide)
+        match = scan_matching.search_within_prior(grid, unlabelled, wide)
         evidence = judge_scan(grid, unlabelled, match, usual)
         if evidence is Evidence.CONTRADICTS:
-            occluded = occluded_share(grid, unlabelled, prior.T_map_base)
+            occluded = scan_matching.occluded_share(grid, unlabelled, prior.T_map_base)
             # odometry may have led the robot to where nothing is mapped
             evidence = Evidence.UNKNOWN if occluded <= _MAX_OCCLUDED else evidence
         if evidence is not Evidence.CONTRADICTS:
-            if not is_poor(match, usual) and not _is_ambiguous(match):
+            if not scan_matching.is_poor(match, usual) and not _is_ambiguous(match):
                 return match, Evidence.AGREES
-            self._unknown += is_poor(match, usual)
+            self._unknown += scan_matching.is_poor(match, usual)
         return None, evidence
 
     @property
@@ -110,11 +104,11 @@ class DeadReckoning:
         return self._unknown >= _MAX_UNKNOWN or self._scans >= _MAX_SCANS
 
 
-def _is_ambiguous(match: ScanMatch) -> bool:
+def _is_ambiguous(match: scan_matching.ScanMatch) -> bool:
     """True if another pose explains the scan about as well."""
     x, y, theta, cost = match.alternatives.T
     is_other = (np.hypot(x, y) > _ALIKE[0]) | (np.abs(theta) > _ALIKE[1])
-    return bool((is_other & (cost < MIN_GAIN)).any())
+    return bool((is_other & (cost < scan_matching.MIN_GAIN)).any())
 
 
 def _propagate(covariance: Float, before: Float, after: Float) -> Float:
