@@ -70,10 +70,9 @@ def run_command(words: list[str]) -> None:
     Raises:
         InputError: an input is at fault.
     """
-    from stillmap.cli.parser import parser
+    from stillmap.cli.parser import parse
 
-    args = parser([words[0]]).parse_args(words)
-    args.words = words
+    args = parse(words)
     args.run(args)
 
 

@@ -9,7 +9,7 @@ import sys
 from contextlib import suppress
 
 from stillmap.cli import console
-from stillmap.cli.parser import EXIT_INPUT, parser
+from stillmap.cli.parser import EXIT_INPUT, parse
 from stillmap.core import errors
 
 EXIT_DEFECT = 1
@@ -21,7 +21,7 @@ def main(argv: list[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # file names need not be valid UTF-8
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        args = _parse(sys.argv[1:] if argv is None else argv)
+        args = parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
         console.handle_signals(main.__code__)
         _share_heaps()
@@ -64,13 +64,6 @@ def _report_failure(error: Exception) -> int:
         _report_defect(error)
         return EXIT_DEFECT
     return EXIT_INPUT
-
-
-def _parse(words: list[str]) -> argparse.Namespace:
-    command = next((word for word in words if not word.startswith("-")), "")
-    args = parser([command]).parse_args(words)
-    args.words = words
-    return args
 
 
 class _Handler(logging.Handler):

@@ -139,6 +139,14 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
     return top
 
 
+def parse(words: list[str]) -> argparse.Namespace:
+    """Parse a command line without the name of the program; it is kept as `words`."""
+    command = next((word for word in words if not word.startswith("-")), "")
+    args = parser([command]).parse_args(words)
+    args.words = words
+    return args
+
+
 class _Version(argparse.Action):
     """Print the version, looked up on demand."""
 

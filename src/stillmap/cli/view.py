@@ -95,11 +95,9 @@ def _has_screen() -> bool:
 
 def _open_browser(address: str) -> bool:
     """Open an address and return whether that succeeded."""
-    if not _has_screen():
-        return False
     import webbrowser
 
-    return webbrowser.open(address)
+    return _has_screen() and webbrowser.open(address)
 
 
 def _open_report(report: Path) -> None:

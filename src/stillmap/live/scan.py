@@ -113,10 +113,7 @@ def to_beams(scan: Scan) -> ScanBeams:
         ValueError: names the argument, what was expected, and what it was.
     """
     stamp_ns = int(from_arrays.stamps_to_ns(np.atleast_1d(np.asarray(scan.stamp)))[0])
-    if scan.points is None:
-        points, hit = _from_ranges(scan)
-    else:
-        points, hit = _from_points(scan)
+    points, hit = _from_ranges(scan) if scan.points is None else _from_points(scan)
     D = points.shape[1]
     times = scan.beam_times
     if times is not None:

@@ -117,12 +117,9 @@ def _write_static_points(
 
 def _make_cloud(stamp_ns: int, frame: str, block: point_cloud.Block) -> Fields:
     """A PointCloud2 of points in a frame: x, y, z, `p_static`, and `rgb` for colours."""
-    fields = (
-        point_cloud.FIELDS
-        if block.colors is None
-        else point_cloud.FIELDS + point_cloud.PACKED_COLOUR
-    )
-    return ros.make_point_cloud(stamp_ns, frame, point_cloud.make_vertices(block, fields))
+    colour = [] if block.colors is None else point_cloud.PACKED_COLOUR
+    vertices = point_cloud.make_vertices(block, point_cloud.FIELDS + colour)
+    return ros.make_point_cloud(stamp_ns, frame, vertices)
 
 
 def _make_scan_writer(

@@ -101,12 +101,7 @@ def _write_records(
 
 
 def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    names = [
-        name
-        for name, _ in (
-            point_cloud.FIELDS + point_cloud.COLOURS if cloud.has_colors else point_cloud.FIELDS
-        )
-    ]
+    names = [name for name, _ in point_cloud.cloud_fields(cloud, point_cloud.COLOURS)]
     line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.has_colors else "") + "\n"
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")
