@@ -62,27 +62,19 @@ def find_doorways(surface: Cells, resolution: float) -> list[Doorway]:
     return out
 
 
-class _Runs:
-    """Rows of adjacent cells along a direction, (R,) each, in the order of rows and along them.
-
-    Args:
-        cells: (K, 2).
-        u: unit direction.
-        aside: rows to either side whose cells count as well.
-    """
-
-    def __init__(self, cells: Cells, u: Float, aside: int) -> None:
-        along = np.round(cells @ u).astype(np.int64)
-        across = np.round(cells @ np.array([-u[1], u[0]])).astype(np.int64)
-        low, stride = along.min(), int(np.ptp(along)) + _MAX_HOLE + 2  # rows do not touch
-        rows = across[:, None] + np.arange(-aside, aside + 1)
-        key = np.unique(rows * stride + (along - low)[:, None])
-        first = np.flatnonzero(np.diff(key, prepend=key[0] - stride) > _MAX_HOLE + 1)
-        last = np.append(first[1:], len(key)) - 1
-        self.row = key[first] // stride
-        self.begin = key[first] - self.row * stride + low
-        self.end = key[last] - self.row * stride + low
-        self.length = self.end - self.begin + 1
+def _find_runs(cells: Cells, u: Float) -> tuple[Index, Index, Index]:
+    """Row, begin and end (R,) of each run of adjacent cells (K, 2) along a unit direction, in the
+    order of rows and along them; the cells of the rows to either side count as well."""
+    along = np.round(cells @ u).astype(np.int64)
+    across = np.round(cells @ np.array([-u[1], u[0]])).astype(np.int64)
+    low, stride = along.min(), int(np.ptp(along)) + _MAX_HOLE + 2  # rows do not touch
+    rows = across[:, None] + np.arange(-1, 2)
+    key = np.unique(rows * stride + (along - low)[:, None])
+    first = np.flatnonzero(np.diff(key, prepend=key[0] - stride) > _MAX_HOLE + 1)
+    last = np.append(first[1:], len(key)) - 1
+    row = key[first] // stride
+    begin, end = (key[at] - row * stride + low for at in (first, last))
+    return row, begin, end
 
 
 def _find_directions(cells: Cells, resolution: float) -> Float:
@@ -109,15 +101,15 @@ def _count_in_rows(across: Index) -> Index:
 
 def _find_gaps(cells: Cells, u: Float, resolution: float) -> tuple[Float, Index]:
     """Ends (G, 2, 2) of the gaps along a direction, and the lengths (G,) of the shorter walls."""
-    runs = _Runs(cells, u, 1)
-    gap = runs.begin[1:] - runs.end[:-1]
-    posts = np.sort(np.column_stack([runs.length[:-1], runs.length[1:]]), axis=1)
+    row, begin, end = _find_runs(cells, u)
+    gap, length = begin[1:] - end[:-1], end - begin + 1
+    posts = np.sort(np.column_stack([length[:-1], length[1:]]), axis=1)
     low, high = (metres / resolution for metres in _WIDTH)
-    fits = (runs.row[1:] == runs.row[:-1]) & (gap >= low) & (gap <= high)
+    fits = (row[1:] == row[:-1]) & (gap >= low) & (gap <= high)
     of = np.flatnonzero(fits & (posts >= np.array(_POSTS) / resolution).all(axis=1))
-    along = np.column_stack([runs.end[of], runs.begin[of + 1]]).astype(np.float64)
+    along = np.column_stack([end[of], begin[of + 1]]).astype(np.float64)
     v = np.array([-u[1], u[0]])
-    return along[..., None] * u + runs.row[of, None, None] * v, posts[of, 0]
+    return along[..., None] * u + row[of, None, None] * v, posts[of, 0]
 
 
 class LoneLeaf(NamedTuple):
