@@ -82,8 +82,7 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) 
     with open_unlinked(folder) as file:
         # a hole that no longer fits on the disk would kill the process by SIGBUS
         os.posix_fallocate(file.fileno(), 0, size)
-        mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
-        return mapped.reshape(shape)
+        return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
 
 
 def release_pages(array: NDArray[Any]) -> None:

@@ -160,8 +160,7 @@ def unproject(camera: Camera, uv: Float) -> Float:
     assert camera.K is not None
     distorted = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
     x = _undistort(lens, distorted)
-    out: Float = np.column_stack([x, np.where(np.isnan(x[:, 0]), np.nan, 1.0)])
-    return out
+    return np.asarray(np.column_stack([x, np.where(np.isnan(x[:, 0]), np.nan, 1.0)]))
 
 
 def is_in_image(camera: Camera, uv: Float) -> Mask:
@@ -192,8 +191,7 @@ def _distort(lens: Lens, x: Float) -> Float:
         scale = np.divide(_distort_angle(k, angle)[0], r, out=np.ones_like(r), where=r > 0.0)
         return scale[:, None] * x
     s, q = _square(x), np.array([k[3], k[2]])
-    out: Float = (_radial(k, s)[0] + 2.0 * (x @ q))[:, None] * x + s[:, None] * q
-    return out
+    return np.asarray((_radial(k, s)[0] + 2.0 * (x @ q))[:, None] * x + s[:, None] * q)
 
 
 def _undistort(lens: Lens, target: Float) -> Float:
@@ -292,10 +290,8 @@ def _limit(lens: Lens) -> float:
 
 
 def _square(x: Float) -> Float:
-    out: Float = x[:, 0] * x[:, 0] + x[:, 1] * x[:, 1]
-    return out
+    return np.asarray(x[:, 0] * x[:, 0] + x[:, 1] * x[:, 1])
 
 
 def _norm(x: Float) -> Float:
-    out: Float = np.sqrt(_square(x))
-    return out
+    return np.asarray(np.sqrt(_square(x)))

@@ -45,8 +45,7 @@ def inverse(T: Float) -> Float:
 
 def increments(T: Float) -> Float:
     """Motions (n - 1, D + 1, D + 1) between successive poses (n, D + 1, D + 1)."""
-    out: Float = inverse(T[:-1]) @ T[1:]
-    return out
+    return np.asarray(inverse(T[:-1]) @ T[1:])
 
 
 def log(T: Float) -> Float:

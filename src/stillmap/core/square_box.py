@@ -169,8 +169,7 @@ def find_busiest(places: Squares, edge: int) -> Squares:
     keys = cell_keys(places // max(edge, 1))
     number, count = np.unique(keys, return_counts=True)
     chosen = places[keys == number[np.argmax(count)]]
-    middle: Squares = np.sort(chosen, axis=0)[len(chosen) // 2]
-    return middle
+    return np.asarray(np.sort(chosen, axis=0)[len(chosen) // 2])
 
 
 def cell_keys(cells: NDArray[np.integer]) -> Squares:

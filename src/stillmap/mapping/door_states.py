@@ -215,8 +215,7 @@ def _find_crossing(ends: Float, scans: Index, known: LabelledRecording) -> Index
     beyond = _cross(b - a, end - a) * np.sign(_cross(b - a, start - a))
     # by so far that noise does not reach back
     passes = (side.prod(axis=0) < 0.0) & (beyond < -_GOES_ON * np.linalg.norm(b - a))
-    crossing: Index = scans[np.unique(of[passes])]
-    return crossing
+    return np.asarray(scans[np.unique(of[passes])])
 
 
 def _cross(a: Float, b: Float) -> Float:

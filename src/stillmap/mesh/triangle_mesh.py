@@ -158,8 +158,7 @@ def simplify(mesh: Mesh, error: float, *, whole_border: bool = True, most: int =
     """
     if len(mesh) <= most or not len(mesh) or error <= 0.0:
         return mesh
-    pyfqmr: Any = import_extra("pyfqmr", "mesh.glb", "made", group="mesh")
-    work = pyfqmr.Simplify()
+    work = import_extra("pyfqmr", "mesh.glb", "made", group="mesh").Simplify()
     work.setMesh(mesh.vertices, mesh.faces)
     work.simplify_mesh(
         target_count=most,

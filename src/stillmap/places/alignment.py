@@ -383,5 +383,4 @@ def _distinct_hypotheses(hypotheses: list[Hypothesis], session: SurfaceMap) -> l
 def spread_evenly(count: int, max_chosen: int) -> list[int]:
     """At most so many of `count` indices, evenly spread."""
     chosen = np.unique(np.linspace(0, count - 1, min(count, max_chosen)).round().astype(np.intp))
-    out: list[int] = chosen.tolist()
-    return out
+    return list(chosen.tolist())

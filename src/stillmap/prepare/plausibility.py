@@ -246,5 +246,4 @@ def _interpolate(seconds: Float, T_odom_base: Float, first: int, n: int) -> Floa
     here, there = T_odom_base[first], T_odom_base[first + n]
     since = seconds[first + 1 : first + n] - seconds[first]
     share = since / (seconds[first + n] - seconds[first])
-    out: Float = here @ se2.exp(share[:, None] * se2.log(se2.inverse(here) @ there))
-    return out
+    return np.asarray(here @ se2.exp(share[:, None] * se2.log(se2.inverse(here) @ there)))

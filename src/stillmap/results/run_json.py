@@ -64,8 +64,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         },
         **(more or {}),
     }
-    plain: dict[str, Any] = to_jsonable(record)
-    return plain
+    return dict(to_jsonable(record))
 
 
 def _counts(recording: Recording, beams: Mapping[str, int], **more: int) -> dict[str, int]:

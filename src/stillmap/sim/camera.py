@@ -139,8 +139,7 @@ def _pick_colors(palette: Float, mover: int, seed: int) -> tuple[Float, Float]:
 
 
 def _to_uint8(colour: Float) -> Color:
-    out: Color = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
-    return out
+    return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
 
 
 def _contrast(blur: Float, size: float) -> Float:

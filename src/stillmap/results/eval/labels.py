@@ -17,8 +17,7 @@ class Scores:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of plain numbers; NaN becomes None, since JSON has no NaN."""
-        scores: dict[str, Any] = to_jsonable(dataclasses.asdict(self))
-        return scores
+        return dict(to_jsonable(dataclasses.asdict(self)))
 
 
 # One certain error costs 13.8 nats. Labels are float32: anything below 6e-8 is lost near 1 anyway.
