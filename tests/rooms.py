@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from stillmap.core.config import override
 from stillmap.sim import Scene, Simulation, simulate
 from stillmap.sim.walls import box
@@ -16,3 +18,10 @@ def drive(
     """A run along a route; `sections` change the options of the scene, as laser={...}."""
     scene = Scene("room", walls=tuple(walls), route=tuple(route))
     return simulate(override(scene, {"crowd": {"people": people}, **sections}), seed)
+
+
+def shown(result: Any, cells: Any) -> Any:
+    """p_occupied of cells (K, 2) of the map frame."""
+    first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)
+    column, row = (cells - first).T
+    return result.map.p_occupied[row, column]

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from rooms import drive
+from rooms import drive, shown
 
 import stillmap
 from stillmap.core.config import override
@@ -66,12 +66,6 @@ def world(leaf):
     laser = {"beams": 361, "range_noise": 0.01, "fov": 2 * np.pi}
     robot = {"scans": 120, "scan_rate": 4.0, "speed": 0.5}
     return drive(np.random.default_rng(3), walls, route, laser=laser, robot=robot)
-
-
-def shown(result, cells):
-    first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)
-    column, row = (cells - first).T
-    return result.map.p_occupied[row, column]
 
 
 def test_an_open_door_is_named_and_shown_as_found(tmp_path):

@@ -5,6 +5,7 @@ import operator
 
 import numpy as np
 import pytest
+from rooms import shown
 
 import stillmap
 from stillmap import em
@@ -66,13 +67,6 @@ def seconds(change):
 def only(kind, stay):
     (one,) = [one for one in built().mapping.changes if one.kind == kind and near(one, stay)]
     return one
-
-
-def shown(result, cells):
-    """p_occupied of cells (K, 2) of the map frame."""
-    first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)
-    column, row = (cells - first).T
-    return result.map.p_occupied[row, column]
 
 
 def test_what_was_moved_left_one_place_and_came_to_another():

@@ -8,6 +8,8 @@ from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.inputs import MeshInputs, TrackedBox
+from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
+from stillmap.mesh.returns import DynamicReturns, collect_tracks, merge_tracks
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_box
 
@@ -105,3 +107,13 @@ def _object(
     return MovingObject(
         id, scans, recording.stamp_ns[scans], xy, v, size, beams[mine], 0.95, height
     )
+
+
+def reconstruct_one(sources: MeshInputs) -> ObjectShape:
+    """The shape of the one thing that all tracks are of."""
+    moves = DynamicReturns.collect(sources)
+    followed = collect_tracks(moves)
+    (whole,) = merge_tracks(followed, moves)
+    shape = reconstruct_object(whole, moves, [np.zeros(0)] * len(whole))
+    assert shape is not None
+    return shape

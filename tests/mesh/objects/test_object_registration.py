@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_up_street import Car, Part, street
+from made_up_street import Car, Part, reconstruct_one, street
 
 from stillmap.mesh import reconstruction
 from stillmap.mesh.inputs import MeshInputs
@@ -17,7 +17,7 @@ from stillmap.mesh.partial_scans import (
     triangulate_partial_scan,
 )
 from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
-from stillmap.mesh.returns import DynamicReturns, collect_tracks, merge_tracks
+from stillmap.mesh.returns import DynamicReturns, collect_tracks
 from stillmap.mesh.triangle_mesh import Mesh
 
 LATER = (-0.4, -0.2, 0.0, 0.2, 0.4)
@@ -83,15 +83,6 @@ CAR = Car((7.0, -3.5), (5.0, 0.0))
 WRONG = Part(0, drift=(0.6, 0.2))
 
 
-def _shape(sources: MeshInputs) -> ObjectShape:
-    moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(moves)
-    (whole,) = merge_tracks(followed, moves)
-    shape = reconstruct_object(whole, moves, [np.zeros(0)] * len(whole))
-    assert shape is not None
-    return shape
-
-
 def _off(shape: ObjectShape) -> np.ndarray:
     """How far the vertices of a model lie off the two sides of the car that are seen."""
     T = shape.frame.T_map_object(shape.seconds)
@@ -103,9 +94,9 @@ def _off(shape: ObjectShape) -> np.ndarray:
 
 def test_several_looks_are_better_than_one(monkeypatch: pytest.MonkeyPatch) -> None:
     sources = street([CAR], [WRONG], scans=9, noise=0.03)
-    shape = _shape(sources)
+    shape = reconstruct_one(sources)
     monkeypatch.setattr(reconstruction, "MERGE_WINDOW", 0.0)
-    alone = _shape(sources)
+    alone = reconstruct_one(sources)
     assert not alone.rigid
     assert shape.rigid
     assert shape.span[1] - shape.span[0] >= 0.4

@@ -3,10 +3,9 @@
 import dataclasses
 
 import numpy as np
-from made_up_street import Car, Part, street
+from made_up_street import Car, Part, reconstruct_one, street
 
 from stillmap.mesh.inputs import MeshInputs, TrackedBox
-from stillmap.mesh.reconstruction import reconstruct_object
 from stillmap.mesh.returns import (
     DynamicReturns,
     cluster_points,
@@ -89,12 +88,7 @@ def test_what_is_left_over_of_a_car_is_no_thing() -> None:
 
 
 def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
-    sources = street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)])
-    moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(moves)
-    (whole,) = merge_tracks(followed, moves)
-    shape = reconstruct_object(whole, moves, [np.zeros(0)] * len(whole))
-    assert shape is not None
+    shape = reconstruct_one(street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)]))
     assert shape.id in (0, 1)
     T = shape.frame.T_map_object(shape.seconds)
     there = shape.mesh.vertices @ T[:3, :3].T + T[:3, 3]
