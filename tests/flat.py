@@ -66,10 +66,11 @@ def map_days(folder: Path) -> None:
         stillmap.build(folder / day, OPTIONS).save(out)
 
 
+def list_files(folder: Path) -> set[str]:
+    """The paths of all files below a folder, relative to it."""
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
 def files_of(folder: Path) -> dict[str, bytes]:
     """The content of all files below a folder, by their paths."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    return {name: (folder / name).read_bytes() for name in sorted(list_files(folder))}

@@ -4,10 +4,26 @@ import json
 import re
 from pathlib import Path
 
+from flat import files_of
+
+# that every result in the plane has
+FILES = {
+    "map.pgm",
+    "map.yaml",
+    "map.npz",
+    "trajectory.tum",
+    "report.html",
+    "run.json",
+    "beams/stamp_ns.npy",
+    "beams/offset.npy",
+    "beams/p_static.npy",
+    "beams/hit.npy",
+}
+
 
 def contents(folder: Path) -> dict[str, bytes]:
     """All files of a result, without what tells of time and memory in them."""
-    out = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    out = files_of(folder)
     run = json.loads(out["run.json"])
     for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
         del run[name]

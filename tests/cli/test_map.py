@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from maps import FILES, QUICK, list_files
+from flat import list_files
+from maps import FILES, QUICK
 from refusals import refused
 
 from stillmap.core.recording import Recording

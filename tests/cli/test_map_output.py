@@ -6,7 +6,8 @@ import shlex
 import shutil
 
 import pytest
-from maps import FILES, QUICK, TWO_ITERATIONS, list_files
+from flat import list_files
+from maps import FILES, QUICK, TWO_ITERATIONS
 from refusals import refused
 
 import stillmap.results.writer

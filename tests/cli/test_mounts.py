@@ -8,7 +8,8 @@ import sys
 import time
 
 import pytest
-from maps import ENDLESS, FILES, QUICK, list_files
+from flat import list_files
+from maps import ENDLESS, FILES, QUICK
 
 STILLMAP = shlex.join([sys.executable, "-m", "stillmap"])
 

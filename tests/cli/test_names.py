@@ -6,7 +6,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from maps import FILES, QUICK, list_files
+from flat import list_files
+from maps import FILES, QUICK
 
 NAME = os.fsdecode(b"h\xe4ll")  # of Latin-1
 PLAIN = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

@@ -7,7 +7,8 @@ import subprocess
 import sys
 
 import pytest
-from maps import FILES, QUICK, list_files
+from flat import list_files
+from maps import FILES, QUICK
 
 import stillmap
 

@@ -6,7 +6,8 @@ import subprocess
 import time
 
 import pytest
-from maps import ENDLESS, FILES, QUICK, list_files
+from flat import list_files
+from maps import ENDLESS, FILES, QUICK
 
 
 def test_closed_stderr_during_progress(start, room, tmp_path):

@@ -6,6 +6,7 @@ Recordings are the seeds of fuzzing.
 import gzip
 import sys
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,14 +51,23 @@ def convert(path: Path, output: Path) -> list[str]:
     return ["convert", str(path), "-o", str(output), "--to", "stillmap", "--quiet"]
 
 
+def _workplace(folder: Path) -> Path:
+    """A new folder beside another one, in which its seeds are made."""
+    work = folder.with_name(f"{folder.name}-made")
+    work.mkdir()
+    return work
+
+
+def _seed(folder: Path, seeds: Callable[[Path], Iterator[bytes]], number: int = 0) -> bytes:
+    """The seed of that number, made beside a folder."""
+    return next(islice(seeds(_workplace(folder)), number, None))
+
+
 def _file(name: str, seeds: Callable[[Path], Iterator[bytes]], number: int = 0) -> Make:
     """A recording in one file: the seed of that number."""
 
     def make(folder: Path) -> Path:
-        work = folder.with_name(f"{folder.name}-made")
-        work.mkdir()
-        found = [seed for _, seed in zip(range(number + 1), seeds(work), strict=False)]
-        (folder / name).write_bytes(found[number])
+        (folder / name).write_bytes(_seed(folder, seeds, number))
         return folder / name
 
     return make
@@ -69,10 +79,8 @@ def _folder(
     """A recording in several files."""
 
     def make(folder: Path) -> Path:
-        work = folder.with_name(f"{folder.name}-made")
-        work.mkdir()
-        found = [seed for _, seed in zip(range(number + 1), seeds(work), strict=False)]
-        for name, content in zip(names, parts.split_parts(found[number]), strict=True):
+        content_of = parts.split_parts(_seed(folder, seeds, number))
+        for name, content in zip(names, content_of, strict=True):
             if content:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).write_bytes(content)
@@ -82,9 +90,7 @@ def _folder(
 
 
 def _ros2_folder(folder: Path) -> Path:
-    work = folder.with_name(f"{folder.name}-made")
-    work.mkdir()
-    (folder / "a_0.mcap").write_bytes(next(corpus_bags.mcap(work)))
+    (folder / "a_0.mcap").write_bytes(_seed(folder, corpus_bags.mcap))
     (folder / "metadata.yaml").write_text(
         "rosbag2_bagfile_information:\n  relative_file_paths: [a_0.mcap]\n"
     )
@@ -92,9 +98,7 @@ def _ros2_folder(folder: Path) -> Path:
 
 
 def _clouds(folder: Path) -> Path:
-    work = folder.with_name(f"{folder.name}-made")
-    work.mkdir()
-    for number, content in enumerate(corpus.pcd(work)):
+    for number, content in enumerate(corpus.pcd(_workplace(folder))):
         (folder / f"{number}.pcd").write_bytes(content)
     return folder
 

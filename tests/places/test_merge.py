@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from flat import list_files
 from report_page import Page
 
 from stillmap.cli.main import main
@@ -31,13 +32,9 @@ def records(place):
     return json.loads((place / "sessions.json").read_text())
 
 
-def files_of(folder):
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-
-
 def differing_files(one, other):
-    assert files_of(one) == files_of(other)
-    return {name for name in files_of(one) if not filecmp.cmp(one / name, other / name, False)}
+    assert list_files(one) == list_files(other)
+    return {name for name in list_files(one) if not filecmp.cmp(one / name, other / name, False)}
 
 
 def test_a_place_has_all_files(place):
@@ -100,7 +97,7 @@ def test_labels_follow_what_all_sessions_saw(days, place):
 @pytest.mark.slow
 def test_growing_gives_the_same_files_as_merging_at_once(days, place, tmp_path):
     assert merge(days / "out-1", days / "out-2", "-o", tmp_path / "two") == 0
-    before = {name: (tmp_path / "two" / name).read_bytes() for name in files_of(tmp_path / "two")}
+    before = {name: (tmp_path / "two" / name).read_bytes() for name in list_files(tmp_path / "two")}
     assert merge(tmp_path / "two", days / "out-3", "-o", tmp_path / "three") == 0
     assert differing_files(place, tmp_path / "three") == set()
     for name, content in before.items():  # the place that grew is as it was

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from flat import list_files
 from place_scores import PlaceScores, score_place
 from place_truth import load_session_truth
 
@@ -70,19 +71,15 @@ def test_changes_and_labels_are_right(scores: PlaceScores) -> None:
     assert labels.stays_kept > 0.999
 
 
-def files_of(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-
-
 def test_growing_gives_the_same_files_as_merging_at_once(
     results: list[Path], place: Path, tmp_path: Path
 ) -> None:
     stillmap.merge(results[:2], options=OPTIONS, output=tmp_path / "two")
     grown = tmp_path / "three"
     stillmap.merge([tmp_path / "two", results[2]], options=OPTIONS, output=grown)
-    assert files_of(grown) == files_of(place)
-    same = {name for name in files_of(place) if filecmp.cmp(place / name, grown / name, False)}
-    assert files_of(place) - same == {"run.json"}  # its options have the cells of the place
+    assert list_files(grown) == list_files(place)
+    same = {name for name in list_files(place) if filecmp.cmp(place / name, grown / name, False)}
+    assert list_files(place) - same == {"run.json"}  # its options have the cells of the place
 
 
 def test_another_street_is_refused(results: list[Path], tmp_path: Path) -> None:

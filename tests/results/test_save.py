@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+import result_contents
 from flat import files_of
 
 from stillmap.core.errors import InputError
@@ -13,21 +14,12 @@ from stillmap.results.writer import save
 from stillmap.tracking import ObjectOptions
 
 FILES = {
-    "map.pgm",
-    "map.yaml",
-    "map.npz",
-    "trajectory.tum",
+    *result_contents.FILES,
     "graph.g2o",
-    "beams/stamp_ns.npy",
-    "beams/offset.npy",
-    "beams/p_static.npy",
-    "beams/hit.npy",
     "objects/objects.json",
     "objects/0000.ply",
     "objects/0001.ply",
     "traffic.npz",
-    "report.html",
-    "run.json",
 }
 
 
