@@ -1,5 +1,5 @@
-"""Settings and fixtures of all tests; tests/reference, tests/marks.py and benchmarks can be
-imported."""
+"""Settings and fixtures of all tests; tests/reference, tests/marks.py, benchmarks and the helpers
+beside the tests of a room can be imported."""
 
 import gc
 import resource
@@ -13,8 +13,15 @@ import pytest
 
 # thousands of collected tests are alive: walking them at every collection costs 8 % of the time
 gc.set_threshold(50_000, 50, 50)
-sys.path.append(str(Path(__file__).resolve().parent))
-sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+TESTS = Path(__file__).resolve().parent
+# helpers have names of their own; those of tests/ros stand in for packages of ROS: not for all
+_WITH_HELPERS = (
+    *("agreement", "benchmarks", "cli", "contract", "em", "faults", "fleet", "fuzz", "io/ros"),
+    *("live", "mapping", "mesh/objects", "mesh/texture", "pipeline", "places", "slam", "tracking"),
+    *("viewer", "whole_runs"),
+)
+sys.path[:0] = [str(TESTS / room) for room in _WITH_HELPERS]
+sys.path += [str(TESTS), str(TESTS.parent / "benchmarks")]
 
 
 @pytest.fixture(scope="session")

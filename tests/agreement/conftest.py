@@ -1,15 +1,12 @@
 """Random beams and rooms on which kernels and twins must agree."""
 
 import resource
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 from surfel_maps import fit_surfels
 
 

@@ -16,8 +16,6 @@ from stillmap.sim import Scene, simulate, write_simulation
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
-
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 

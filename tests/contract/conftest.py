@@ -1,6 +1,5 @@
 """Fixtures: results of a small hall and a street, to be read by other programs."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -9,9 +8,6 @@ from stillmap.cli.main import main
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.sim import scene_by_name, simulate, write_simulation
-
-# for opening_models.py and map_server_rules.py here, and made_up_rooms.py
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "mesh" / "texture")]
 
 
 @pytest.fixture(scope="session")

@@ -3,14 +3,10 @@
 import json
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
-
 from opening_models import HERE, MODULES, require
 from PIL import Image
 from small_place import RECORD, make_place

@@ -1,13 +1,9 @@
 """What all tests of faults share: modules beside them, and an end in time."""
 
 import signal
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).resolve().parent))
 
 _PATIENCE = 60  # s
 

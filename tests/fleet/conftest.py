@@ -10,17 +10,14 @@ from typing import Any
 import distributed
 import numpy as np
 import pytest
+import stand_in as stand_ins
+from fleet_processes import NAMES, wait_until
+from result_contents import contents
 
 from stillmap.cli.main import main
 from stillmap.sim import Scene, simulate, write_simulation
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
-
-import stand_in as stand_ins
-from fleet_processes import NAMES, wait_until
-from result_contents import contents
 
 
 def _record(path: Path, seed: int, scans: int) -> None:

@@ -2,9 +2,7 @@
 
 import re
 import socket
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pye57")
 pytest.importorskip("lzf")  # of the seeds
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "fuzz"))
-
 import containers
 import corpus
 

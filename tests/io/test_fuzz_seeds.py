@@ -1,15 +1,11 @@
 """Seeds of fuzzing are valid, and mutated containers stay readable."""
 
 import random
-import sys
-from pathlib import Path
 
 import pytest
 
 for needed in ("pye57", "laspy", "lazrs", "lzf"):
     pytest.importorskip(needed)
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "fuzz"))
-
 import targets  # noqa: E402
 from run import NAMES  # noqa: E402
 

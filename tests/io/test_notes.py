@@ -1,15 +1,11 @@
 """Notes of readers in recording folders: those of ours stay, others do not get in the way."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
 for needed in ("pye57", "laspy", "lazrs", "lzf"):
     pytest.importorskip(needed)
-sys.path.append(str(Path(__file__).resolve().parent.parent / "faults"))
-
 from faulty_inputs import RECORDINGS  # noqa: E402
 
 from stillmap.core.json import to_json, to_jsonable  # noqa: E402

@@ -1,15 +1,9 @@
 """A populated corridor, pushed scan by scan."""
 
-import sys
-from pathlib import Path
-
 import pytest
+from live_runs import Run, simulate_sweeps
 
 from stillmap.sim import scene_by_name, simulate
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
-
-from live_runs import Run, simulate_sweeps
 
 
 @pytest.fixture(scope="session")

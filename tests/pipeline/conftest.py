@@ -1,8 +1,6 @@
 """A small populated room that every test of the loop can afford, and what they run it with."""
 
 import functools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ import pytest
 from stillmap.sim import Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
 from stillmap.sim.walls import box
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 
 @functools.cache

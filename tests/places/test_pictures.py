@@ -1,14 +1,9 @@
 """The map of a place as of its sessions."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 from small_place import BOX, CELL, CHAIR, DOOR, OPEN, ORIGIN, SIZE, make_place
 
 from stillmap.results.colors import KIND_COLORS

@@ -6,15 +6,10 @@ import html
 import io
 import json
 import re
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from PIL import Image
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 from report_page import Page
 from small_place import RECORD, make_place
 

@@ -1,14 +1,9 @@
 """A place over its sessions, read from its files."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 from small_place import CELL, CHAIR, NAMES, SIZE, box_of, make_changes, make_place, write_states
 
 from stillmap.core.errors import InputError

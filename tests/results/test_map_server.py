@@ -1,17 +1,12 @@
 """map.pgm and map.yaml against the rules of map_server."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from PIL import Image
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "contract"))
-
 from map_server_rules import load
+from PIL import Image
 
 from stillmap.results.map_server import raw_pixels, trinary_pixels, write_map_server
 

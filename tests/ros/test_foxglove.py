@@ -2,9 +2,7 @@
 
 import re
 import signal
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here: make test-ros makes an e
 pytest.importorskip("foxglove", reason="foxglove-sdk is not here: make test-ros installs it")
 pytest.importorskip("websockets", reason="the client is not here: make test-ros installs it")
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "live"))
 from foxglove_client import Client, pose_of, stamp_of
 
 import stillmap

@@ -1,8 +1,6 @@
 """Rooms and simulated scans."""
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Float32
 from stillmap.sim.laser import Movers, cast_beams, compute_beam_angles
 from stillmap.sim.walls import box, pillar, polyline
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 ROOMS = {
     "hall with a case": (*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),

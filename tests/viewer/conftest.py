@@ -1,11 +1,10 @@
 """A small result in the plane and one in space, as `stillmap map` writes them, with models."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_models import triangle_glb
 
 from stillmap import io as recordings
 from stillmap.core import se2
@@ -15,10 +14,6 @@ from stillmap.results.point_cloud import write_clouds
 from stillmap.results.viewer.scene import Beams, Scene
 from stillmap.results.writer import write_labels
 from stillmap.slam import SlamOptions
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
-
-from made_up_models import triangle_glb
 
 SCANS = 6
 STAMPS = 1_700_000_000_000_000_000 + 500_000_000 * np.arange(SCANS)

@@ -1,13 +1,9 @@
 """A place in the viewer: a slider over its sessions."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
-
 from small_place import CHAIR, NAMES, make_place
 
 from stillmap.cli.main import main

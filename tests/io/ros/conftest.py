@@ -1,12 +1,8 @@
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 from small_bags import KINDS, Messages, write_bag
 
 

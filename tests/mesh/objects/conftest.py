@@ -1,6 +1,5 @@
 """A small room with people, seen by a lidar and a camera, or by two lasers and a camera."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +9,6 @@ from stillmap.cli.main import main
 from stillmap.sim import Scene, scene_by_name, simulate, write_simulation
 from stillmap.sim.options import CameraOptions, CrowdOptions, LidarOptions, RobotOptions
 from stillmap.sim.walls import box
-
-_HERE = Path(__file__).resolve()
-# for made_up_street.py, and made_up_rooms.py
-sys.path[:0] = [str(_HERE.parent), str(_HERE.parents[1] / "texture")]
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 
