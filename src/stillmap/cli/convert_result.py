@@ -95,11 +95,8 @@ def _convert_to_table(args: argparse.Namespace, result: ResultFolder, output: Pa
     import_extra("pyarrow.parquet", output, "written")
     exported = _read_result(args, result, output)
     if exported.recording.dimension != 2:
-        raise InputError(
-            "is of a 3D recording: no table",
-            where=str(result.folder),
-            hint=f"its points as a cloud ({_CLOUDS}), all of it as a bag (.mcap, .bag)",
-        )
+        hint = f"its points as a cloud ({_CLOUDS}), all of it as a bag (.mcap, .bag)"
+        raise InputError("is of a 3D recording: no table", where=str(result.folder), hint=hint)
     tables.write_parquet(exported, output)
     return f"{exported.recording.n_beams} beams"
 
@@ -154,11 +151,9 @@ def _build_cloud(
     with show_share(args.quiet, "reading") as progress:
         recording, labels = result.read(progress, scratch)
     if recording.dimension != 3:
-        raise InputError(
-            "is a 2D result: it has no point cloud",
-            where=str(result.folder),
-            hint=f"{_PARQUET} holds the end points of its beams",
-        )
+        hint = f"{_PARQUET} holds the end points of its beams"
+        what = "is a 2D result: it has no point cloud"
+        raise InputError(what, where=str(result.folder), hint=hint)
     poses = result.read_poses(recording)
     deskewed = deskew_recording(recording, poses, result.slam_options)
     colors = reader.read_colors(result.folder, recording.n_beams)

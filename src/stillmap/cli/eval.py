@@ -33,11 +33,9 @@ def _score_relations(args: argparse.Namespace) -> dict[str, Any]:
         args.compose,
     )
     if not errors.used:
-        raise InputError(
-            f"no relation has a pose of {args.trajectory} within {args.max_dt:g} s at both ends",
-            where=str(args.relations),
-            hint="other clocks? --odom reaches further",
-        )
+        what = f"no relation has a pose of {args.trajectory} within {args.max_dt:g} s at both ends"
+        hint = "other clocks? --odom reaches further"
+        raise InputError(what, where=str(args.relations), hint=hint)
     return errors.to_dict()
 
 
@@ -189,9 +187,8 @@ def run(args: argparse.Namespace) -> int:
     for name, value in vars(args).items():
         least = 0.0 if name == "max_dt" else 1e-9
         if isinstance(value, float) and not least <= value < math.inf:
-            raise InputError(
-                f"--{name.replace('_', '-')} must be at least {least:g}, got {value:g}"
-            )
+            flag = f"--{name.replace('_', '-')}"
+            raise InputError(f"{flag} must be at least {least:g}, got {value:g}")
     score = _SCORES[args.score]
     values = score.compute(args)
     if args.json:

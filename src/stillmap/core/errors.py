@@ -128,9 +128,8 @@ def import_extra(module: str, path: object, action: str = "read", *, group: str 
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
-        raise MissingExtra(
-            f"needs {package} to be {action}", where=str(path), hint=install_command(group)
-        ) from error
+        what = f"needs {package} to be {action}"
+        raise MissingExtra(what, where=str(path), hint=install_command(group)) from error
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -262,9 +262,8 @@ def poses_from_tum(path: Path, recording: Recording) -> Float:
     if len(missing):
         first = f"the first is scan {missing[0]} at {recording.stamp_ns[missing[0]] / 1e9:.3f} s"
         of = f"{len(missing)} of {recording.n_scans} scans"
-        raise InputError(
-            f"no pose within {_TOLERANCE_NS / 1e9:g} s of {of}, {first}", where=str(path)
-        )
+        what = f"no pose within {_TOLERANCE_NS / 1e9:g} s of {of}, {first}"
+        raise InputError(what, where=str(path))
     return poses[nearest]
 
 

@@ -100,17 +100,12 @@ def require_mappable(recording: Recording, options: Options, poses: Float | None
         raise InputError("holds no scan that can be used", where=where)
     require_plausible(recording, where)
     if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
-        raise InputError(
-            f"is 3D: estimator '{options.estimator}' is for 2D recordings",
-            where=where,
-            hint=f"estimator={' or '.join(em.ESTIMATORS_3D)}",
-        )
+        what = f"is 3D: estimator '{options.estimator}' is for 2D recordings"
+        raise InputError(what, where=where, hint=f"estimator={' or '.join(em.ESTIMATORS_3D)}")
     if recording.dimension == 2 or poses is not None or recording.T_odom_base is not None:
         return
     if recording.source.has_depth_camera:
         stated = recording.T_recorded_base is not None
-        raise InputError(
-            "holds depth images, whose poses have to be given",
-            where=where,
-            hint='poses="recording"' if stated else 'poses="FILE.tum"',
-        )
+        hint = 'poses="recording"' if stated else 'poses="FILE.tum"'
+        what = "holds depth images, whose poses have to be given"
+        raise InputError(what, where=where, hint=hint)

@@ -143,10 +143,8 @@ def require_overlap(occupancy: GridMap, region: Region | None) -> None:
     if region is not None and _cells(occupancy, region) is None:
         x0, y0, x1, y1 = (f"{value:.2f}" for value in extent(occupancy))
         wanted = " ".join(f"{value:g}" for value in region)
-        raise InputError(
-            f"the region {wanted} lies outside the map",
-            hint=f"the map spans {x0} to {x1} m in x, {y0} to {y1} m in y",
-        )
+        hint = f"the map spans {x0} to {x1} m in x, {y0} to {y1} m in y"
+        raise InputError(f"the region {wanted} lies outside the map", hint=hint)
 
 
 def passes(one: MovingObject, region: Region | None) -> bool:

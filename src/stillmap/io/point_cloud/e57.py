@@ -90,9 +90,8 @@ def _check_xml(path: Path) -> None:
         head = file.read(48)
         start, length = (int.from_bytes(head[at : at + 8], "little") for at in (24, 32))
         if len(head) < 48 or head[:8] != MAGIC or not str(path).isprintable():
-            raise InputError(
-                "is no E57 file, or has a name that libe57 cannot open", where=str(path)
-            )
+            what = "is no E57 file, or has a name that libe57 cannot open"
+            raise InputError(what, where=str(path))
         if length > _MAX_XML or start > file.size:
             raise InputError("is damaged: its XML section", where=str(path))
         first = start // _PAGE * _PAGE
