@@ -193,9 +193,8 @@ def options_from_args(args: argparse.Namespace) -> "Options":
     options = Options()
     if args.config:
         options = config.override(options, config.load_toml(Path(args.config)), args.config)
-    options = config.override(
-        options, config.merge_nested(*map(config.parse_assignment, args.assignments)), "--set"
-    )
+    given = config.merge_nested(*map(config.parse_assignment, args.assignments))
+    options = config.override(options, given, "--set")
     return config.override(options, flag_changes(args))
 
 

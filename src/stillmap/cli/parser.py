@@ -59,9 +59,8 @@ class Parser(argparse.ArgumentParser):
         """Print the error on one line and exit."""
         advice = f"{hint} see" if hint else "see"
         line = f"{message} ({advice} {self.prog} --help)".replace("\n", " ")
-        self.exit(
-            EXIT_INPUT, f"{colorize(f'{self.prog}:', 'error', sys.stderr)} {printable(line)}\n"
-        )
+        name = colorize(f"{self.prog}:", "error", sys.stderr)
+        self.exit(EXIT_INPUT, f"{name} {printable(line)}\n")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Flush and exit: --help and --version may go into a closed pipe."""

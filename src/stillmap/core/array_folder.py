@@ -60,9 +60,8 @@ def read_array(
         InputError: it is missing, damaged, or another one; where it grows, shorter.
     """
     array = open_npy(path, scratch, shape[0] if grows else None)
-    fits = len(array.shape) == len(shape) and all(
-        size in (None, given) for given, size in zip(array.shape, shape, strict=True)
-    )
+    sizes = zip(array.shape, shape, strict=True)
+    fits = len(array.shape) == len(shape) and all(size in (None, given) for given, size in sizes)
     if not fits or array.dtype != np.dtype(dtype):
         target = f"({', '.join('any' if n is None else str(n) for n in shape)}) {np.dtype(dtype)}"
         what = f"is damaged: expected {target}, got {array.shape} {array.dtype}"

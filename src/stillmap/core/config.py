@@ -263,9 +263,8 @@ def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
 
 def describe_range(limits: Mapping[str, Any]) -> str:
     """The range of a number in words; empty where there is none."""
-    return " and ".join(
-        f"{words} {limits[key]:.10g}" for key, words in _BOUNDS.items() if key in limits
-    )
+    parts = (f"{words} {limits[key]:.10g}" for key, words in _BOUNDS.items() if key in limits)
+    return " and ".join(parts)
 
 
 def iter_names(options: Any) -> Iterator[str]:
@@ -310,9 +309,8 @@ def parse_assignment(text: str) -> dict[str, Any]:
     except (ValueError, RecursionError):
         parsed = {}
     # more than one key: the value had several lines, and only looked like TOML
-    return nest(
-        {key.strip(): parsed["value"] if len(parsed) == 1 else _number_or_text(value.strip())}
-    )
+    wanted = parsed["value"] if len(parsed) == 1 else _number_or_text(value.strip())
+    return nest({key.strip(): wanted})
 
 
 def _number_or_text(value: str) -> float | str:

@@ -39,9 +39,8 @@ class TrackStates:
 
 def initialize(x: Float, position_std: float, speed_std: float = SPEED_STD) -> TrackStates:
     """States at positions x (K, D) with zero velocity; standard deviations in m and m/s."""
-    return TrackStates(
-        x, np.zeros_like(x), np.tile([position_std**2, 0.0, speed_std**2], (len(x), 1))
-    )
+    P = np.tile([position_std**2, 0.0, speed_std**2], (len(x), 1))
+    return TrackStates(x, np.zeros_like(x), P)
 
 
 def concatenate(a: TrackStates, b: TrackStates) -> TrackStates:

@@ -289,9 +289,8 @@ def select_changed_cells(cells: CellHistories) -> ChangedCells:
     static surface that was missed for a while.
     """
     odds = _log_odds(cells.p_changing) - _log_odds(np.array([cells.changing_weight]))
-    return cells.select(
-        (cells.n_changes > 0) & (cells.n_changes < MIN_RECURRING_CHANGES) & (odds > _MIN_LOG_RATIO)
-    )
+    is_single = (cells.n_changes > 0) & (cells.n_changes < MIN_RECURRING_CHANGES)
+    return cells.select(is_single & (odds > _MIN_LOG_RATIO))
 
 
 def _log_odds(p: NDArray[np.floating]) -> Float:

@@ -56,9 +56,8 @@ def _normalize(counts: Float, n_static: int, initial_static: float) -> Float:
     total = counts.sum()
     weight = counts[:n_static].sum() / total if total > 0.0 else initial_static
     weight = float(np.clip(weight, 1.0 - _MAX_STATIC_WEIGHT, _MAX_STATIC_WEIGHT))
-    return np.concatenate(
-        [weight * static / static.sum(), (1.0 - weight) * dynamic / dynamic.sum()]
-    )
+    parts = [weight * static / static.sum(), (1.0 - weight) * dynamic / dynamic.sum()]
+    return np.concatenate(parts)
 
 
 def _limit(weights: Float, rare: Bool, max_weight: float) -> Float:

@@ -254,9 +254,8 @@ def update_pda(states: TrackStates, xy: Float, beta: Float) -> TrackStates:
     spread = (beta * (innovation**2).sum(axis=-1)).sum(axis=1) - (mean**2).sum(axis=-1)
     # both axes share one covariance, so the spread is that of the mean axis
     less = beta.sum(axis=1) * S - 0.5 * spread
-    P = np.stack(
-        [xx - gain_x**2 * less, xv - gain_x * gain_v * less, vv - gain_v**2 * less], axis=-1
-    )
+    columns = xx - gain_x**2 * less, xv - gain_x * gain_v * less, vv - gain_v**2 * less
+    P = np.stack(columns, axis=-1)
     return TrackStates(states.x + gain_x[:, None] * mean, states.v + gain_v[:, None] * mean, P)
 
 

@@ -196,9 +196,8 @@ def apply_pooled_evidence(p_static: Float32, means: Float32) -> Float32:
         means: (E, 2) a and b of each surfel's clusters: mean P(dynamic), and mean evidence of a
             change in nats; NaN where it is in no cluster.
     """
-    above = np.nan_to_num(
-        means - np.array([_POOLED_P_DYNAMIC, _POOLED_CHANGE], np.float32), nan=-1.0
-    )
+    least = np.array([_POOLED_P_DYNAMIC, _POOLED_CHANGE], np.float32)
+    above = np.nan_to_num(means - least, nan=-1.0)
     nats = np.minimum(_POOLING_SLOPE * above.max(axis=1), _MAX_POOLED)
     lower = np.where(nats > 0.0, 1.0 / (1.0 + np.exp(nats)), 1.0)
     return np.minimum(p_static, lower.astype(np.float32))

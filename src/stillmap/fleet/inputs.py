@@ -269,9 +269,8 @@ def short_name(location: str) -> str:
 def make_unique(name: str, taken: set[str]) -> str:
     """`name`, or `name-2`, `name-3`, ... where it is taken; case does not matter."""
     numbered = (f"{name}-{number}" for number in itertools.count(2))
-    unique = next(
-        each for each in itertools.chain([name], numbered) if each.casefold() not in taken
-    )
+    candidates = itertools.chain([name], numbered)
+    unique = next(each for each in candidates if each.casefold() not in taken)
     taken.add(unique.casefold())
     return unique
 

@@ -263,9 +263,8 @@ def _read_folder(name: str, given: CameraOverride, folder: Path, where: Path) ->
         file = where.parent / given.times
         used = text_lines.stamp_files(files, text_lines.read_times(file), file)
     else:
-        named = text_lines.stamps_from_names(
-            [text_lines.strip_extension(file.name, EXTENSIONS) for file in files]
-        )
+        stems = [text_lines.strip_extension(file.name, EXTENSIONS) for file in files]
+        named = text_lines.stamps_from_names(stems)
         if named is None:
             hint = f"times = 'FILE' in camera '{name}' of {where}: one line of seconds per image"
             raise InputError("holds images whose names are no stamps", where=str(folder), hint=hint)

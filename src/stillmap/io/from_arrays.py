@@ -158,9 +158,8 @@ def _read_options(min_range: float, max_range: float | None) -> ReadOptions:
     end = MAX_PLAUSIBLE_RANGE if max_range is None else max_range
     if not (0.0 <= min_range < end <= MAX_PLAUSIBLE_RANGE):
         raise ValueError(f"min_range, max_range: expected {limits}, got {min_range}, {max_range}")
-    return ReadOptions(
-        min_range=float(min_range), max_range=None if max_range is None else float(max_range)
-    )
+    longest = None if max_range is None else float(max_range)
+    return ReadOptions(min_range=float(min_range), max_range=longest)
 
 
 def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
@@ -211,9 +210,8 @@ def stamps_to_ns(stamps: ArrayLike) -> Int64:
     falls = np.flatnonzero(np.diff(out) < 0)
     if len(falls):
         t = int(falls[0]) + 1
-        raise ValueError(
-            f"stamps: expected no decrease, got {given[t]} after {given[t - 1]} at {t}"
-        )
+        fall = f"{given[t]} after {given[t - 1]} at {t}"
+        raise ValueError(f"stamps: expected no decrease, got {fall}")
     return out
 
 

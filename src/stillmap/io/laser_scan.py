@@ -69,9 +69,8 @@ def beam_angles(recording: Recording) -> Float:
                 continue
             candidate = _fit_angles(points, usable)
             if not _fits(candidate, points, usable):
-                raise InputError(
-                    f"scan {t}: the directions of its beams are not evenly spaced", hint=_HINT
-                )
+                what = f"scan {t}: the directions of its beams are not evenly spaced"
+                raise InputError(what, hint=_HINT)
             of_laser[n] = candidate
         out[t] = candidate
     for t in undetermined:
@@ -101,10 +100,8 @@ def range_limits(recording: Recording) -> list[RangeLimits]:
         far[s] = max(far[s], length.max(where=~is_hit & ~np.isnan(length), initial=0.0))
     rules = [notes.ranges for notes in _sensor_notes(recording)]
     recorded = [0.0 if rule is None else max(rule.threshold or 0.0, 0.0) for rule in rules]
-    return [
-        RangeLimits(float(h), n or float(f) or None)
-        for h, f, n in zip(hit, far, recorded, strict=True)
-    ]
+    lasers = zip(hit, far, recorded, strict=True)
+    return [RangeLimits(float(h), n or float(f) or None) for h, f, n in lasers]
 
 
 def time_increments(recording: Recording) -> tuple[Float, int]:
@@ -139,9 +136,8 @@ def _fits(angles: tuple[float, float], points: Float, usable: Index) -> bool:
     x, y = points[usable].T
     c, s = np.cos(angle), np.sin(angle)
     along, across = x * c + y * s, np.abs(x * s - y * c)
-    return bool(
-        np.all((along >= 0.0) & (across <= np.maximum(_TOLERANCE_M, _TOLERANCE_RAD * along)))
-    )
+    tolerance = np.maximum(_TOLERANCE_M, _TOLERANCE_RAD * along)
+    return bool(np.all((along >= 0.0) & (across <= tolerance)))
 
 
 def _fit_angles(points: Float, usable: Index) -> tuple[float, float]:

@@ -164,9 +164,8 @@ def select_state(state: LoopState, keyframes: Index, stay: Bool) -> LoopState:
         moved = _move_closure(decided, state.poses, keyframes, at)
         if moved is None or not stay[decided.later]:
             continue
-        new = dataclasses.replace(
-            moved, earlier=int(number[moved.earlier]), later=int(number[moved.later])
-        )
+        earlier, later = (int(number[k]) for k in (moved.earlier, moved.later))
+        new = dataclasses.replace(moved, earlier=earlier, later=later)
         decided_on.append(new)
         attempted.append(dataclasses.replace(new, rejected=attempt.rejected))
         if id(decided) in is_fitting:

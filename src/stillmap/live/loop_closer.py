@@ -122,9 +122,8 @@ class LoopCloser:
         self._reported = _extend(self._reported, self._reported_T_map_local, context.poses)
         chain = loop_candidates.odometry_constraints(context, [])
         new = context.keyframes[first:]
-        self._centers = np.concatenate(
-            [self._centers, loop_candidates.view_centers(replace(context, keyframes=new))]
-        )
+        added = loop_candidates.view_centers(replace(context, keyframes=new))
+        self._centers = np.concatenate([self._centers, added])
         before = self._state
         poses = _extend(before.poses, self._T_map_local, context.poses[context.keyframes])
         state = replace(before, poses=poses)

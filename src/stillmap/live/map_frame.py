@@ -61,9 +61,8 @@ class MapCorrection:
         self._labels, self._D = labels, poses.shape[-1] - 1
         self.T_map_local, self.untied = correction.T_map_local, correction.untied
         self.count = len(correction.poses)  # of the spaced scans that were known
-        self.poses = np.concatenate(
-            [correction.poses, correction.T_map_local @ spaced[len(correction.poses) :]]
-        )
+        later = correction.T_map_local @ spaced[len(correction.poses) :]
+        self.poses = np.concatenate([correction.poses, later])
         # in 3D the local map moves with its frame: it holds what is near, not what loops tie to it
         self.local_map = LocalMap(labels.resolution) if self._D == 2 else None
         tagged = np.minimum(tagged, len(poses) - 1)

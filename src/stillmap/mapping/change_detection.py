@@ -252,9 +252,8 @@ def group_events(events: Events, cells: Cells, radius: float, slack: int = 0) ->
     begin = np.maximum(events.before[i], events.before[j])
     end = np.minimum(events.after[i], events.after[j])
     fits = (events.came[i] == events.came[j]) & (begin < end + slack)
-    return [
-        events.select(members) for members in connected_components(pairs[fits], len(events.cell))
-    ]
+    groups = connected_components(pairs[fits], len(events.cell))
+    return [events.select(members) for members in groups]
 
 
 def _split_by_time(events: Events, cells: Cells, resolution: float) -> list[Change]:

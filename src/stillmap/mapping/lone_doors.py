@@ -177,9 +177,8 @@ def _find_passages(
     hit = door_states.find_hit_cells(scans, known)
     moved = leaf._replace(cells=leaf.cells[~np.isin(cell_keys(leaf.cells), cell_keys(hit))])
     along = np.round((moved.cells - leaf.hinge) @ leaf.shut)
-    inner = np.arange(
-        math.ceil(door_states.INNER[0] * leaf.length), door_states.INNER[1] * leaf.length
-    )
+    first, last = (share * leaf.length for share in door_states.INNER)
+    inner = np.arange(math.ceil(first), last)
     if np.isin(inner, along).mean() < _MIN_MOVED:
         return leaf, scans[:0]
     if not abs(door_states.measure_slope(ends, observations, known)) <= _MAX_SLOPE:

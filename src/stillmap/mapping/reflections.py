@@ -106,9 +106,8 @@ def _sample_beams(recording: Recording, poses: Float, p_static: Float32) -> Beam
         sampled[recording.beams_of(scan)] = True
     beams = np.flatnonzero(sampled & recording.hit)
     origins = T_map_sensor[recording.scans_of(beams), :2, 2]
-    return Beams(
-        origins, recording.end_points(beams, poses), p_static[beams] > 0.5, T_map_sensor[:, :2, 2]
-    )
+    ends = recording.end_points(beams, poses)
+    return Beams(origins, ends, p_static[beams] > 0.5, T_map_sensor[:, :2, 2])
 
 
 def _find_on_line(

@@ -208,9 +208,8 @@ def integrate_patches(
         parts.append(triangle_mesh.simplify(extract_tile(volume, tile, min_weight), error))
         tell(n + n * done // len(tiles), 2 * n)
     del volume  # frees the voxels before the mesh grows
-    mesh = triangle_mesh.remove_small_components(
-        triangle_mesh.weld(triangle_mesh.concatenate_meshes(parts)), min_area
-    )
+    welded = triangle_mesh.weld(triangle_mesh.concatenate_meshes(parts))
+    mesh = triangle_mesh.remove_small_components(welded, min_area)
     return triangle_mesh.simplify_to_budget(triangle_mesh.simplify(mesh, error), error, max_faces)
 
 

@@ -200,9 +200,8 @@ def _describe(of: str, parameters: dict[str, Parameter]) -> Iterator[str]:
     for name, parameter in parameters.items():
         if parameter.significant:
             what, unit, factor = _QUANTITIES[name]
-            value, std, nominal = (
-                factor * v for v in (parameter.value, parameter.std, parameter.nominal)
-            )
+            numbers = (parameter.value, parameter.std, parameter.nominal)
+            value, std, nominal = (factor * number for number in numbers)
             yield (
                 f"{of}: {what} is {value:.4g} +- {std:.2g}{unit}, as the motion shows, not "
                 f"{nominal:.4g} as recorded: used"

@@ -119,9 +119,8 @@ def _lost_scans(best: Estimate, recording: Recording) -> list[int]:
     is_lost = best.m_step.explained < _LOST
     starts = [0, *best.m_step.diagnostics.breaks, recording.n_scans]
     for first, end in itertools.pairwise(starts):
-        _, of_sensor, n = np.unique(
-            recording.sensor[first:end], return_index=True, return_counts=True
-        )
+        sensor = recording.sensor[first:end]
+        _, of_sensor, n = np.unique(sensor, return_index=True, return_counts=True)
         is_lost[first + of_sensor[n > 1]] = False  # of a sensor that moves, each scan is the first
     return np.flatnonzero(is_lost).tolist()
 

@@ -149,9 +149,8 @@ class EmState(ShortRepr):
         self.records.append(record)
         gain = np.inf
         if self.best is not None:
-            gain = self._score(record, n_beams) - self._score(
-                self.records[self.best.number - 1], n_beams
-            )
+            kept = self.records[self.best.number - 1]
+            gain = self._score(record, n_beams) - self._score(kept, n_beams)
         if gain > 0.0 or fixed:
             self.best = estimate.without_grid()
         self._take_snapshot(iteration)

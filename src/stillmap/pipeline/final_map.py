@@ -77,9 +77,8 @@ def final_estimate(recording: Recording, best: Estimate, options: Options) -> Fi
     deskewed, reflected = remove_reflections(deskewed, best.poses, best.p_static, cell)
     found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)
     if reflected is not None:  # unusable beams have no label
-        found.p_static[reflected] = np.where(
-            recording.hit[reflected], P_REFLECTED, options.em.prior
-        )
+        hit = recording.hit[reflected]
+        found.p_static[reflected] = np.where(hit, P_REFLECTED, options.em.prior)
     best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
         return FinalEstimate(deskewed, best, [], [])

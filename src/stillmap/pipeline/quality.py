@@ -78,9 +78,8 @@ def rate_quality(
         apart += [] if disagreement is None else [disagreement]
         for part in window.split(_JUDGED_SCANS):
             of_part = p_static[part.beams]
-            counts.append(
-                final_labels.count_expected(part.recording, _candidates(part), of_part, threads)
-            )
+            candidates = _candidates(part)
+            counts.append(final_labels.count_expected(part.recording, candidates, of_part, threads))
     evidence = replace(
         _measure_geometry(deskewed, poses, occupancy),
         expected_f1=final_labels.expected_f1(counts),

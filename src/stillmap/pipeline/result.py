@@ -174,9 +174,8 @@ def map_recording(
     state = resume or EmState(options)
     state.options = options  # a checkpoint has those from before the direction of spin was found
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
-    state.single_pass = (
-        recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
-    )
+    is_3d = recording.dimension == 3
+    state.single_pass = is_3d and poses is not None and options.estimator == "stillmap"
     steps = iterate(
         recording,
         options,

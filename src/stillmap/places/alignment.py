@@ -118,10 +118,8 @@ class _Search:
         cells -= np.where(cells >= self._inside, self._shape, 0)  # shifts to the other side
         xy = (cells + self._half) * self.cell + self._low
         values = score.ravel()[at].tolist()
-        return [
-            _Optimum(value, x, y, heading)
-            for value, (x, y) in zip(values, xy.tolist(), strict=True)
-        ]
+        found = zip(values, xy.tolist(), strict=True)
+        return [_Optimum(value, x, y, heading) for value, (x, y) in found]
 
     def _rotate_field(self, heading: float) -> Raster:
         """The session's field on cells about its middle; 0 where nothing is known."""
@@ -264,9 +262,8 @@ class MapRefiner:
     def _score(self, x: Float) -> float:
         """Evidence of both maps with the session's middle at x, y and its heading."""
         T = _to_alignment(self._middle, *x.tolist())
-        return self._look_up(self._place, self._session, T) + self._look_up(
-            self._session, self._place, se2.inverse(T)
-        )
+        back = self._look_up(self._session, self._place, se2.inverse(T))
+        return self._look_up(self._place, self._session, T) + back
 
     def _look_up(self, known: _Layer, seen: _Layer, T: Float) -> float:
         points = seen.points @ T[:2, :2].T + T[:2, 2]

@@ -164,9 +164,8 @@ def _find_groups(place: PlaceStates) -> list[Events]:
     for group in group_events(apart, place.cells, radius):
         out += _split_by_time(group, min_cells)
     out = [_attach(group, beside, place) for group in out]
-    return [
-        group for group in out if len(np.unique(group.cell)) >= _MIN_LISTED[place.cells.shape[1]]
-    ]
+    min_listed = _MIN_LISTED[place.cells.shape[1]]
+    return [group for group in out if len(np.unique(group.cell)) >= min_listed]
 
 
 def _attach(group: Events, beside: Events, place: PlaceStates) -> Events:
@@ -180,9 +179,8 @@ def _attach(group: Events, beside: Events, place: PlaceStates) -> Events:
     at = at[are_near(place.cells[beside.cell[at]], place.cells[group.cell], _BESIDE)]
     first, last = beside.before[at], beside.after[at]
     at = max((at[(first <= s) & (last > s)] for s in range(before, after)), key=len)
-    return Events._make(
-        np.concatenate([own, further[at]]) for own, further in zip(group, beside, strict=True)
-    )
+    columns = zip(group, beside, strict=True)
+    return Events._make(np.concatenate([own, further[at]]) for own, further in columns)
 
 
 def _share_evidence(place: PlaceStates, groups: list[Events]) -> PlaceStates:

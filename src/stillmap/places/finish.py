@@ -149,12 +149,10 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     joined = join_keyframes([placed.session.keyframes for placed in place.sessions]).recording
     poses = np.concatenate([placed.keyframe_poses for placed in place.sessions])
     if place.dimension == 3:
-        labels = np.concatenate(
-            [_label_keyframes(placed, result.shown) for placed in place.sessions]
-        )
-        point_cloud.write_clouds(
-            folder, joined, shift_poses(poses, by.metres), labels, origin=by.metres
-        )
+        parts = [_label_keyframes(placed, result.shown) for placed in place.sessions]
+        labels = np.concatenate(parts)
+        moved = shift_poses(poses, by.metres)
+        point_cloud.write_clouds(folder, joined, moved, labels, origin=by.metres)
     planar = [placed.require_evidence()[1] for placed in place.in_time()]
     occupancy = place_map.make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)
@@ -211,9 +209,8 @@ def _write_session(folder: Path, result: PlaceResult, placed: PlacedSession, tim
     write_tum(home / "trajectory.tum", placed.session.stamp_ns, poses)
     beams = store.read_beam_cells(home, placed.session, place.voxel_size)
     centres = beams.place_centres(placed.session.node_poses, placed.nodes)
-    arrays.write_npy(
-        home / "beams" / "p_static.npy", place_map.label_session(result.shown, beams, centres, time)
-    )
+    p_static = place_map.label_session(result.shown, beams, centres, time)
+    arrays.write_npy(home / "beams" / "p_static.npy", p_static)
     write_arrays(home / store.STATE, {"nodes": placed.nodes, "measured_at": placed.measured_at})
 
 
@@ -273,10 +270,8 @@ def _join_graphs(place: Place) -> PoseGraph:
     """The pose graph of all sessions; scans are numbered through all of them."""
     sessions = [placed.session for placed in place.sessions]
     first_scan = accumulate([0, *(len(session.stamp_ns) for session in sessions)])
-    keyframes = [
-        session.graph.keyframes + first
-        for session, first in zip(sessions, first_scan, strict=False)
-    ]
+    pairs = zip(sessions, first_scan, strict=False)
+    keyframes = [session.graph.keyframes + first for session, first in pairs]
     chain, loops = join_constraints(sessions, place.ties)
     nodes = np.concatenate([placed.nodes for placed in place.sessions])
     return PoseGraph(np.concatenate(keyframes), nodes, [*chain, *loops])

@@ -73,9 +73,8 @@ def _tilt(at: Float, rise: Float) -> Float:
     slope = np.zeros(2)
     if len(at) >= _MIN_NODES and offset.std(axis=0).min() >= _MIN_SPREAD:
         kept = np.abs(rise - height) <= 3.0 * np.median(np.abs(rise - height)) + 1e-3
-        fit = np.linalg.lstsq(
-            np.column_stack([offset[kept], np.ones(int(kept.sum()))]), rise[kept], rcond=None
-        )[0]
+        columns = np.column_stack([offset[kept], np.ones(int(kept.sum()))])
+        fit = np.linalg.lstsq(columns, rise[kept], rcond=None)[0]
         slope, height = np.clip(fit[:2], -_MAX_TILT, _MAX_TILT), float(fit[2])
     # a rotation vector (slope_y, -slope_x, 0) raises a point by its offset times the slope
     turn = se3.exp(np.array([0.0, 0.0, height, slope[1], -slope[0], 0.0]))
@@ -268,9 +267,8 @@ def _optimize(place: Place, placed: PlacedSession, ties: list[Tie]) -> tuple[Pla
     ties that agree with it."""
     sessions = [*place.sessions, placed]
     all_ties = [*place.ties, *ties]
-    nodes, agree = optimize_nodes(
-        [each.session for each in sessions], [each.nodes for each in sessions], all_ties
-    )
+    start = [each.nodes for each in sessions]
+    nodes, agree = optimize_nodes([each.session for each in sessions], start, all_ties)
     kept = [tie for tie, agrees in zip(all_ties, agree.tolist(), strict=True) if agrees]
     grown = replace(place, sessions=sessions, ties=kept).with_nodes(nodes)
     return grown, float(agree[len(place.ties) :].mean())

@@ -129,10 +129,8 @@ def chain_poses(poses: Float) -> PoseGraph:
     metres = np.linalg.norm(steps[:, :D, D], axis=1) + _MIN_STEP
     turns = D * (D - 1) // 2
     unit = np.diag(np.square([_STEP_STD[0]] * D + [_STEP_STD[1]] * turns))
-    chain = [
-        Constraint(k, k + 1, T, length * unit)
-        for k, (T, length) in enumerate(zip(steps, metres.tolist(), strict=True))
-    ]
+    motions = enumerate(zip(steps, metres.tolist(), strict=True))
+    chain = [Constraint(k, k + 1, T, length * unit) for k, (T, length) in motions]
     return PoseGraph(nodes, poses[nodes], chain)
 
 

@@ -80,9 +80,8 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
     stands, gone = _settle_unlisted(place, changes)
     p_shown[stands], p_shown[gone] = 1.0, 0.0
     total = place.evidence.sum(axis=1, keepdims=True) - place.evidence
-    support = np.where(
-        states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
-    )
+    is_static = states.p_static[:, None] > _MIN_P_STATIC
+    support = np.where(is_static, np.clip(total, 0.0, _MAX_SUPPORT), 0.0)
     return ShownState(place, p_shown, support.astype(np.float32), np.concatenate([stands, gone]))
 
 

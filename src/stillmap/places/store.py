@@ -183,9 +183,8 @@ def read_session(home: Path, path: str | None, threads: int = 1) -> Session:
         or not ((e >= 0.0) & (e <= 1.0)).all()
     ):
         raise _inconsistent(state)
-    keyframes = Keyframes(
-        recording, scans, poses[scans], e, np.searchsorted(scans, graph.keyframes)
-    )
+    nodes = np.searchsorted(scans, graph.keyframes)
+    keyframes = Keyframes(recording, scans, poses[scans], e, nodes)
     run = ResultFolder(home, read_run(home))
     output, origin = run.output_options, run.read_origin(SESSION_ORIGIN)
     band = output.min_obstacle_height, output.max_obstacle_height

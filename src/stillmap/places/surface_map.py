@@ -127,10 +127,8 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
         if (first >= high).any():
             continue
         part = tuple((high - first).tolist())
-        where = tuple(
-            slice(int(f) // _STEP, int(f + n) // _STEP)
-            for f, n in zip(first - low, part, strict=True)
-        )
+        spans = zip(first - low, part, strict=True)
+        where = tuple(slice(int(f) // _STEP, int(f + n) // _STEP) for f, n in spans)
         for session in sessions:
             cells = session.crop(first, part)
             most, least = _pool(cells[0], np.maximum), _pool(cells[1], np.minimum)

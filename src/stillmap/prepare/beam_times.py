@@ -106,9 +106,8 @@ def assemble_tilting_laser(
         seconds_of_beams = 1e-9 * (beam_stamps_ns(recording, scans) - joint_ns[0])
         flat = recording.points[beams].astype(np.float64)
         local = flat @ T[:3, :2].T + T[:3, 3]
-        points[beams] = rotate_about_axis(
-            local, np.array(axis), np.interp(seconds_of_beams, seconds, joint_angle)
-        )
+        angle = np.interp(seconds_of_beams, seconds, joint_angle)
+        points[beams] = rotate_about_axis(local, np.array(axis), angle)
         recording.release_pages(points)
     return replace(
         recording,

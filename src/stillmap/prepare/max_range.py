@@ -84,9 +84,8 @@ def _find_code(ranges: Float32, real: Float32) -> tuple[float, str] | None:
         codes = real[real >= np.float32(_SICK_CODES[0])]
         how = f"SICK overflow values from {codes.min():.2f} m ({codes.size} x)"
         return _decimal(codes.min()), how
-    values, counts = np.unique(
-        real[real >= top - _CODE_WINDOW - _REFERENCE_WINDOW], return_counts=True
-    )
+    longest = real[real >= top - _CODE_WINDOW - _REFERENCE_WINDOW]
+    values, counts = np.unique(longest, return_counts=True)
     at_top = values >= top - _CODE_WINDOW
     mode = int(np.argmax(np.where(at_top, counts, 0)))
     per_cm = float(counts[~at_top].sum()) / (100.0 * _REFERENCE_WINDOW)
@@ -203,9 +202,8 @@ def find_self_sectors(ranges: Float32, min_range: float) -> tuple[SelfSector, ..
     if T < 20 or n < 2:
         return ()
     # codes for no return are as large as float32 allows
-    valid = np.where(
-        (ranges >= min_range) & (ranges < MAX_PLAUSIBLE_RANGE), ranges, np.float32(np.inf)
-    )
+    is_valid = (ranges >= min_range) & (ranges < MAX_PLAUSIBLE_RANGE)
+    valid = np.where(is_valid, ranges, np.float32(np.inf))
     median = np.median(valid, axis=0)
     with np.errstate(invalid="ignore"):
         deviation = np.abs(valid - median)

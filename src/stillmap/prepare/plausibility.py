@@ -226,18 +226,16 @@ def _find_late_intervals(seconds: Float, T_odom_base: Float, n: int) -> Index:
     excess = motion / duration[:, None] - usual
     is_late = np.zeros(len(first), np.bool_)
     for axes, acceleration in (([0, 1], _ACCELERATION), ([2], _ANGULAR_ACCELERATION)):
-        speed, change, deviation = (
-            np.linalg.norm(each[:, axes], axis=1) for each in (usual, after - before, 2.0 * excess)
-        )
+        vectors = (usual, after - before, 2.0 * excess)
+        speed, change, deviation = (np.linalg.norm(each[:, axes], axis=1) for each in vectors)
         is_steady = np.maximum(change, deviation) < _MAX_SPEED_CHANGE * speed
         for k in range(1, n):
             since = (seconds[first + k] - seconds[first]).clip(0.0, duration)
             expected = T_odom_base[first] @ se2.exp((since / duration)[:, None] * motion)
             off = se2.parameters(se2.inverse(expected) @ T_odom_base[first + k])[:, axes]
             lag = -(off * usual[:, axes]).sum(axis=1) / speed.clip(1e-9)
-            is_late |= is_steady & (
-                lag > np.maximum(_MIN_LAG, 0.5 * acceleration * since * (duration - since))
-            )
+            min_lag = np.maximum(_MIN_LAG, 0.5 * acceleration * since * (duration - since))
+            is_late |= is_steady & (lag > min_lag)
     return first[is_late]
 
 

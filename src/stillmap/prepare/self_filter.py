@@ -186,9 +186,8 @@ def _find_constant_cells(recording: Recording, scans: list[int], R: Float) -> Bo
         occupied[tuple(_cell_indices(points, _CELL).T)] = True
         in_cell += occupied
         near_cell += _dilate(occupied, (0, 1, 2))
-    return np.asarray(
-        (near_cell >= _MIN_SHARE_NEAR * len(scans)) & (in_cell >= _MIN_SHARE_IN_CELL * len(scans))
-    )
+    is_near = near_cell >= _MIN_SHARE_NEAR * len(scans)
+    return np.asarray(is_near & (in_cell >= _MIN_SHARE_IN_CELL * len(scans)))
 
 
 def _find_extended_cells(recording: Recording, scans: list[int], R: Float) -> Bool:

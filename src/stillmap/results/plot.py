@@ -72,9 +72,8 @@ def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:
         ax.add_patch(patches.Rectangle(tuple(low[:2]), width, height, **style))
         for box in earlier:
             before, after = np.mean(box, axis=0)[:2], 0.5 * (low + high)[:2]
-            ax.annotate(
-                "", tuple(after), tuple(before), arrowprops={"arrowstyle": "->", "color": color}
-            )
+            arrow = {"arrowstyle": "->", "color": color}
+            ax.annotate("", tuple(after), tuple(before), arrowprops=arrow)
 
 
 def summarize_as_html(result: MappedPlace) -> str:

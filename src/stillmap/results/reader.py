@@ -86,9 +86,8 @@ def is_result(path: Path) -> bool:
 
 def is_place(path: Path) -> bool:
     """True if a folder is a place of several sessions, also one from which a file was taken."""
-    return (path / "sessions").is_dir() and any(
-        (path / one).is_file() for one in (SESSIONS, "ties.npz")
-    )
+    marks = [path / one for one in (SESSIONS, "ties.npz")]
+    return (path / "sessions").is_dir() and any(mark.is_file() for mark in marks)
 
 
 # arrays
@@ -217,9 +216,8 @@ def _find_map(result: Path) -> Path:
 def _read_layer(path: Path, name: str, kinds: str) -> tuple[NDArray[Any], Origin, float]:
     """A layer (H, W) of one of these kinds of types, the origin (x, y, yaw) of its lower-left
     corner, and its resolution."""
-    layer, origin, edge = array_folder.read_npz(
-        path, (name, "origin", "resolution"), _MAX_MAP
-    ).values()
+    names = (name, "origin", "resolution")
+    layer, origin, edge = array_folder.read_npz(path, names, _MAX_MAP).values()
     if layer.ndim != 2 or layer.dtype.kind not in kinds:
         hint = "maps are in the plane"
         raise InputError(f"{name} is {layer.shape} {layer.dtype}", where=str(path), hint=hint)

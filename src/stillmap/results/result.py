@@ -217,11 +217,10 @@ def build(
             recording = recording.without_odometry()
         kept = inputs.read_poses(poses, recording)
         inputs.require_mappable(recording, chosen, kept)
-        return Result.of(
-            map_recording(
-                recording, chosen, poses=kept, progress=report, stages=stages, scratch=folder
-            )
+        mapping = map_recording(
+            recording, chosen, poses=kept, progress=report, stages=stages, scratch=folder
         )
+        return Result.of(mapping)
 
 
 def load(path: PathLike, *, recording: Source | None = None) -> Result:

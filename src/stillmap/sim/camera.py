@@ -232,9 +232,8 @@ class CameraSimulator:
         T_base_camera = np.stack([c.T_base_camera for c in cameras if c.T_base_camera is not None])
         moment = Moment(motion, self._scan, self._seconds)
         self.T_world_camera = world.T_world_base(moment) @ T_base_camera[which]
-        self.images = Images(
-            np.repeat(stamp_ns, o.count), which, cameras, lambda image: self.render(image).color
-        )
+        stamps = np.repeat(stamp_ns, o.count)
+        self.images = Images(stamps, which, cameras, lambda image: self.render(image).color)
 
     def __len__(self) -> int:
         return len(self.images)

@@ -123,9 +123,8 @@ def _select_clusters(points: DynamicPoints, owner: Index, lasting: Bool) -> _Clu
         edge[:, k] = xy[order[first + size - 1]]
     scan = points.scan[begins]
     nearest = np.minimum.reduceat(points.range[own], first) if len(begins) else np.zeros(0)
-    return _Clusters(
-        points.cluster[begins], scan, points.seconds[scan], nearest, points.sensor[scan], edge
-    )
+    seconds, sensor = points.seconds[scan], points.sensor[scan]
+    return _Clusters(points.cluster[begins], scan, seconds, nearest, sensor, edge)
 
 
 def _cluster_begins(points: DynamicPoints) -> Index:

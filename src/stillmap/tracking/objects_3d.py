@@ -61,10 +61,8 @@ def track_objects_3d(
     planar = make_planar_recording(recording, points, np.ones(len(nearest), np.bool_), offset)
     objects = track_objects(planar, planar_poses, p_static[nearest], options)
     owned = _collect_beams(objects, nearest, segment, beam)
-    found_3d = [
-        _add_height(mover, beams, recording, poses, p_static)
-        for mover, beams in zip(objects, owned, strict=True)
-    ]
+    pairs = zip(objects, owned, strict=True)
+    found_3d = [_add_height(mover, beams, recording, poses, p_static) for mover, beams in pairs]
     return select_movers(drop_surface_parts(found_3d, recording, p_static), recording, poses)
 
 

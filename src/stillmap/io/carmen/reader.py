@@ -107,10 +107,8 @@ def _describe_lasers(used: list[LaserLog], log: CarmenLog, options: ReadOptions)
         angles = _find_angles(laser, log.params, given, warnings)
         angles = -angles if upside_down else angles
         counts = [config.n for config in laser.configs]
-        directions = [
-            unit_vectors(first + step * np.arange(n))
-            for (first, step), n in zip(angles, counts, strict=True)
-        ]
+        configs = zip(angles, counts, strict=True)
+        directions = [unit_vectors(first + step * np.arange(n)) for (first, step), n in configs]
         raw = laser.raw(directions, _find_max_range(laser, log.params))
         first, step = angles[raw.typical_shape].tolist()
         lasers.append(raw)

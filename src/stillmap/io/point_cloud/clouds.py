@@ -76,10 +76,8 @@ def read_clouds(
     files = files_of(path, extensions)
     names = [strip_extension(file.name, extensions) for file in files]
     stamps: Sequence[int | None] = stamps_from_names(names) or [None] * len(files)
-    sources = [
-        CloudSource(file.name, partial(read_cloud, file), stamp)
-        for file, stamp in zip(files, stamps, strict=True)
-    ]
+    pairs = zip(files, stamps, strict=True)
+    sources = [CloudSource(file.name, partial(read_cloud, file), stamp) for file, stamp in pairs]
     recording = build_recording(sources, notes, context, single=path.is_file())
     origin.record_in(recording, in_sensor_frame=in_sensor_frame)
     return recording

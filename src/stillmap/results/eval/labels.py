@@ -117,9 +117,8 @@ def compute_average_precision(score: Float, positive: Bool) -> float:
 
 def compute_precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, float, float]:
     """Precision, recall and F1 of the mask `called`; NaN where a denominator is zero."""
-    both, n_called, n_positive = (
-        int(np.count_nonzero(mask)) for mask in (called & positive, called, positive)
-    )
+    masks = (called & positive, called, positive)
+    both, n_called, n_positive = (int(np.count_nonzero(mask)) for mask in masks)
     return (
         both / n_called if n_called else NAN,
         both / n_positive if n_positive else NAN,

@@ -110,10 +110,8 @@ def read_zones(path: Path) -> list[Zone]:
         InputError: names the file and the feature that is at fault.
     """
     content = parse(read_json(path, _MAX_BYTES), _Collection, path, "a GeoJSON FeatureCollection")
-    return [
-        _read_zone(one, Path(f"{path}: feature {number}"))
-        for number, one in enumerate(content.features, start=1)
-    ]
+    numbered = enumerate(content.features, start=1)
+    return [_read_zone(one, Path(f"{path}: feature {number}")) for number, one in numbered]
 
 
 def _read_zone(content: dict[str, Any], where: Path) -> Zone:

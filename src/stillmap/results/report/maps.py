@@ -69,9 +69,8 @@ def draw_written_map(occupancy: GridMap, mode: MapMode) -> WrittenMap:
     edge = factor * occupancy.resolution
     window = (x0, y0, x0 + pixels.shape[1] * edge, y0 + pixels.shape[0] * edge)
     greys = (OCCUPIED, UNKNOWN, FREE) if mode == "trinary" else _PERCENT_GREYS
-    return WrittenMap(
-        figures.color_by_index(pixels, ((grey,) * 3 for grey in greys)), window, factor
-    )
+    picture = figures.color_by_index(pixels, ((grey,) * 3 for grey in greys))
+    return WrittenMap(picture, window, factor)
 
 
 def _reduce_states(p_occupied: Float32, factor: int) -> NDArray[np.uint8]:
@@ -79,9 +78,8 @@ def _reduce_states(p_occupied: Float32, factor: int) -> NDArray[np.uint8]:
     states = trinary_pixels(p_occupied)
     occupied, free = states == OCCUPIED, states == FREE
     if factor > 1:
-        n_free, n_known = (
-            figures.count_in_squares(cells, factor) for cells in (free, ~np.isnan(p_occupied))
-        )
+        masks = (free, ~np.isnan(p_occupied))
+        n_free, n_known = (figures.count_in_squares(cells, factor) for cells in masks)
         occupied = figures.count_in_squares(occupied, factor) > 0
         free = (n_free > 0) & (2 * n_free >= n_known)
     return np.where(occupied, 0, np.where(free, 2, 1)).astype(np.uint8)

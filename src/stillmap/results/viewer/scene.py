@@ -244,9 +244,8 @@ class Beams:
         """
         D, T = self.recording.dimension, self.recording.n_scans
         first, end = max(scan - _NEIGHBORS[D], 0), min(scan + _NEIGHBORS[D] + 1, T)
-        near = deskew_recording(
-            self.recording.slice_scans(first, end), self.poses[first:end], self.slam
-        )
+        scans = self.recording.slice_scans(first, end)
+        near = deskew_recording(scans, self.poses[first:end], self.slam)
         beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
         use = np.flatnonzero(near.hit[at])
         use = use[sample_indices(len(use), max_count)]

@@ -77,9 +77,8 @@ class Sessions:
     def update(self, with_labels: bool) -> None:
         """Draw what changed since the session before, with labels or without."""
         for kind, node in self._lines.items():
-            outlines = [
-                _outline(one, self._nodes.height) for one in self._changes if one.kind == kind
-            ]
+            of_kind = [one for one in self._changes if one.kind == kind]
+            outlines = [_outline(one, self._nodes.height) for one in of_kind]
             node.visible = bool(outlines)
             if outlines:
                 drawn = np.concatenate(outlines) - self._nodes.origin(3)

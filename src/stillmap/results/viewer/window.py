@@ -259,9 +259,8 @@ class Window:
             }
             colorings = self._layers.colorings
             self._coloring = gui.add_dropdown("Points by", colorings, visible=len(colorings) > 1)
-            self._coloring.on_update(
-                self._defer(lambda: self._layers.color_points(self._coloring.value))
-            )
+            recolor = self._defer(lambda: self._layers.color_points(self._coloring.value))
+            self._coloring.on_update(recolor)
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         for note in scene.notes:
             gui.add_markdown(escape_markdown(note))
