@@ -7,10 +7,18 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+with suppress(ImportError):  # not where the tests of ROS run
+    from hypothesis import HealthCheck, settings
+
+    # a busy machine makes examples slowly, and takes long for each
+    patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.register_profile("patient", patient)
+    settings.load_profile("patient")
 # thousands of collected tests are alive: walking them at every collection costs 8 % of the time
 gc.set_threshold(50_000, 50, 50)
 TESTS = Path(__file__).resolve().parent

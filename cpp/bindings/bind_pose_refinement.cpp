@@ -35,7 +35,8 @@ auto refine(OccupancyGrid<2>& grid, const Points<2>& points, const Flat<bool>& h
             const Stds& step_std, const Flat<bool>& has_step, const Flat<double>& own_pose_std,
             double sigma, int radius, double floor, double unknown, double information_scale,
             int max_iterations, double max_gap, double tolerance, double max_gap_ratio,
-            double normal_radius, double normal_max_gap, double flat_below, double round_from) {
+            double normal_radius, double normal_max_gap, double flat_below, double round_from,
+            double correlation_length) {
   const auto scans = scans_from<2>(points, hit, offset, T_base_sensor);
   const size_t n = scans.n_scans;
   const float* weights = per_beam(e, points.shape(0), "e");
@@ -47,10 +48,12 @@ auto refine(OccupancyGrid<2>& grid, const Points<2>& points, const Flat<bool>& h
   require(
       normal_radius > 0.0 && normal_max_gap > 0.0 && flat_below >= 0.0 && round_from > flat_below,
       "normal_radius, normal_max_gap, flat_below, round_from: as of estimate_normals");
+  require(correlation_length > 0.0, "correlation_length: expected a positive length");
   const RefinementOptions options{
       {{sigma, radius, floor, unknown}, information_scale, max_iterations},
       {max_gap, tolerance, max_gap_ratio},
       {normal_radius, normal_max_gap, flat_below, round_from},
+      correlation_length,
       step_with(own_pose_std.data())};
   const auto steps = steps_from(increments, step_std, has_step);
   std::vector<Pose<2>> all;
@@ -89,6 +92,7 @@ void bind_pose_refinement(nb::module_& m) {
       nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"), nb::arg("max_iterations"),
       nb::arg("max_gap"), nb::arg("tolerance"), nb::arg("max_gap_ratio"), nb::arg("normal_radius"),
       nb::arg("normal_max_gap"), nb::arg("flat_below"), nb::arg("round_from"),
+      nb::arg("correlation_length"),
       "Equation (9) for n successive scans in 2D: each is taken out of the grid if it is in it, "
       "registered from its pose by Newton steps, and added again where it is found. poses "
       "(n + 2, 3, 3) T_map_base: the scan before, the scans, the scan after. The prior is the "

@@ -52,6 +52,27 @@ def test_a_wall_a_corner_and_a_single_point():
     assert isotropy[40] > 0.4
 
 
+@pytest.mark.parametrize("length", [0.1, 3.0])
+def test_shares_of_evidence_agree_with_the_twin(length):
+    points = scans(4)
+    shares = _core.evidence_shares(points, correlation_length=length)
+    expected = surface_normals.evidence_shares(points.astype(float), length)
+    np.testing.assert_allclose(shares, expected, atol=1e-6)
+    assert 0.0 <= shares.min() < 0.9 < shares.max() <= 1.0
+
+
+def test_a_surface_has_as_much_evidence_near_the_laser_as_far_from_it():
+    angles = np.linspace(-1.0, 1.0, 400)
+    near, far = (
+        np.stack([np.full(400, x), x * np.tan(angles)], axis=-1).astype(np.float32)
+        for x in (0.3, 3)
+    )
+    sums = [_core.evidence_shares(wall, correlation_length=0.1).sum() for wall in (near, far)]
+    metres = [2 * x * np.tan(1.0) for x in (0.3, 3)]
+    np.testing.assert_allclose(sums, np.array(metres) / 0.1, atol=1.5)
+    assert len(_core.evidence_shares(np.zeros((0, 2), np.float32), correlation_length=0.1)) == 0
+
+
 def test_empty_scans_and_points_at_the_sensor():
     normals, isotropy = _core.estimate_normals(np.zeros((0, 2), np.float32), **OPTIONS)
     assert normals.shape == (0, 2)

@@ -84,7 +84,7 @@ def test_odometry_that_stands_still_under_a_fast_laser():
         for beams, T_odom_base in zip(iter_beams(simulation.recording), odometry, strict=True):
             updates.append(mapper.push(beams, T_odom_base))
     slips = np.array(["slip" in update.doubts for update in updates])
-    assert slips[300:500].mean() > 0.7  # the robot stands, too
+    assert slips[300:500].mean() > 0.6  # the robot stands, too
     assert not slips[:300].any()
     assert not slips[515:].any()
     assert error(simulation, updates, range(600)) < 0.1

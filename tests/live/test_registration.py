@@ -83,7 +83,14 @@ def look(normals_deg, weight=1.0):
     n = len(angles)
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
     flat = np.zeros(n, np.float32)
-    return Scan(np.zeros_like(normals), np.full(n, weight, np.float32), np.eye(3), normals, flat)
+    return Scan(
+        np.zeros_like(normals),
+        np.full(n, weight, np.float32),
+        np.eye(3),
+        normals,
+        flat,
+        np.ones(n, np.float32),
+    )
 
 
 def rectangular(rng, count=120, off=0.0):

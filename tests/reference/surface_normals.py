@@ -46,3 +46,10 @@ def surface_information(points, weights, normals, isotropy, pose):
         J = np.array([[1.0, 0.0, -lever[1]], [0.0, 1.0, lever[0]]])
         out += weight * J.T @ ((1.0 - s) * np.outer(n, n) + s * np.eye(2)) @ J
     return out
+
+
+def evidence_shares(points, correlation_length):
+    """Shares (N,) of the evidence of end points (N, 2) that is not their neighbours', too."""
+    gaps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    own = np.minimum(np.concatenate([[np.inf], gaps, [np.inf]]) / correlation_length, 1.0)
+    return 0.5 * (own[:-1] + own[1:])

@@ -58,7 +58,7 @@ def test_structure_beside_a_wall_locates_a_view_behind_it(width):
     off, chi = over_the_wall(divided(width))
     assert len(off) >= 3
     assert np.abs(off[:, 1]).max() < 0.02
-    assert np.abs(off[:, 2]).max() < 0.01
+    assert np.abs(off[:, 2]).max() < 0.015
     assert chi.max() < 9.0  # along the walls it may slide, and says so
 
 
@@ -104,6 +104,6 @@ def test_comparable_beams_were_observed_from_the_same_side():
     before = ends + np.array([[-1, 0], [1, 0], [-1, 0]], np.float32)
     view = _View([0], np.eye(3)[None], hits, before)
     part, share = _select_comparable(grid, view, np.eye(3))
-    np.testing.assert_array_equal(part.weights, np.array([0.5, 0.0, 0.0], np.float32))
-    assert share == pytest.approx(0.5)
+    np.testing.assert_array_equal(part.weights, hits.weights * np.array([1, 0, 0], np.float32))
+    assert share == pytest.approx(hits.weights[0] / hits.weights.sum())
     assert part.points is hits.points

@@ -80,6 +80,18 @@ def test_odometry_leap():
     assert ate(mapped, simulation.truth) < 0.01
 
 
+def test_what_covers_the_view_does_not_hold_the_robot():
+    # somebody leans on the robot: many end points, on little surface
+    simulation = small_room(ALL_ROUND)
+    points = simulation.recording.points.copy()
+    for t in range(20, 40):
+        beams = simulation.recording.beams_of(t)
+        covered = points[beams][: 2 * (beams.stop - beams.start) // 3]
+        covered *= np.float32(0.3) / np.linalg.norm(covered, axis=1, keepdims=True)
+    recording = dataclasses.replace(simulation.recording, points=points)
+    assert ate(build(recording), simulation.truth) < 0.02
+
+
 def test_known_movers_do_not_bias_poses():
     # everybody marches off with the robot: with e = 0 only walls count
     simulation = small_room(people=3)

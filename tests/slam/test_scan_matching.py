@@ -23,7 +23,8 @@ def placed(grid, points, weights, prior, other=None, usual=1.0):
     match = match_scan(grid, seen, prior, usual)
     if len(points) == 0 or not is_poor(match, usual):
         return match
-    return widen_match(grid, seen, prior, other, match, usual)
+    priors = [prior] if other is None else [prior, other]
+    return widen_match(grid, seen, priors, match, usual)
 
 
 def ones(points):

@@ -12,7 +12,7 @@ from stillmap import _core
 from stillmap.core import se2
 from stillmap.slam import motion_model, scan_hits, trajectory_cost
 from stillmap.slam.options import OdometryOptions
-from stillmap.slam.scan_matching import FAULT_COST
+from stillmap.slam.scan_matching import FAULT_COST, INFORMATION_SCALE
 
 
 def run_with_a_fault(scans=9):
@@ -70,7 +70,7 @@ def test_where_cells_begin_is_no_evidence():
         moved = se2.matrix(shift, shift, 0.0) @ poses
         evidence.append(trajectory_cost.map_evidence(recording, e, scans, moved, 0.05))
         grid = scan_hits.count_beams(recording, e, scans, moved, 0.05)
-        of_grids.append(0.2 * grid.log_evidence(0.02, 0.5))
+        of_grids.append(INFORMATION_SCALE * grid.log_evidence(0.02, 0.5))
     assert evidence == pytest.approx([np.mean(of_grids)] * 2, abs=1.0)
     assert abs(of_grids[0] - of_grids[1]) > 20.0
 

@@ -5,7 +5,6 @@ no single scan shows, of wheels that spin or odometry that stands still, is show
 hypothesis about the motion, which has poses of its own.
 """
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +73,7 @@ class RivalMotion:
         std = _STANDING_STD if self.stands else (guess.translation_std, guess.rotation_std)
         prior = gaussian_prior(self.pose @ self.step, *std)
         # labels that follow from the pose by odometry would leave out what contradicts it
-        unlabelled = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
+        unlabelled = scan.weighted(np.ones_like(scan.shares))
         match = refine_pose(grid, unlabelled, prior, prior.T_map_base)
         # by end points alone: the local map is smeared along a motion that was none, and beams of
         # a robot that stands seem to pass through it
@@ -110,24 +109,28 @@ class OdometryFaults:
         self._unconfirmed: tuple[Float, Float] | None = None
 
     def predict(
-        self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
+        self,
+        measured: MotionPrior | None,
+        guess: MotionPrior,
+        increment: Float | None,
+        ns: int,
+        seconds: float,
     ) -> MotionPrior:
         """The prior of the next scan: by odometry while it is valid, else at constant velocity.
 
         Args:
-            pose: (3, 3) T_map_base of the last scan.
+            measured: prior of odometry; None: there is none.
             guess: prior of constant velocity.
-            increment: (3, 3) of odometry since; None: there is none.
+            increment: (3, 3) of odometry since the last scan; None: there is none.
             ns: stamp of the scan.
             seconds: since the last one.
         """
         self.increment, self._guess, self._ns = increment, guess, ns
-        if increment is None:
+        if measured is None or increment is None:
             return guess
         if np.hypot(*increment[:2, 2]) > max(motion_model.MIN_LEAP, _MAX_SPEED * seconds):
             self._is_valid = False
-        by_odometry = motion_model.odometry_prior(pose, increment, self._options)
-        return by_odometry if self._is_valid else guess
+        return measured if self._is_valid else guess
 
     def detect(
         self,

@@ -41,10 +41,12 @@ def select_hits(beams: ScanBeams) -> Scan:
 
 
 def thin(hits: Scan) -> Scan:
-    """Hits for registration: more than so many say no more."""
+    """Hits for registration, of weights P(static): more than so many say no more."""
     every = slice(None, None, max(-(-len(hits.points) // _MAX_REGISTERED), 1))
     names = ("points", "weights", "normals", "isotropy")
-    return replace(hits, **{n: np.ascontiguousarray(getattr(hits, n)[every]) for n in names})
+    thinned = {name: np.ascontiguousarray(getattr(hits, name)[every]) for name in names}
+    shares = scan_hits.evidence_shares(thinned["points"])
+    return replace(hits, **thinned, shares=shares).weighted(thinned["weights"])
 
 
 class WallDirections:
@@ -114,9 +116,11 @@ class ScanOdometry:
         """
         if self._is_first:
             return motion_model.gaussian_prior(self._front_end.pose, 1e-3, 1e-3)
-        ns, seconds = beams.stamp_ns, self._seconds_to(beams)
-        front_end = self._front_end
-        return self._faults.predict(front_end.pose, front_end.predict(), increment, ns, seconds)
+        ns, seconds, front_end = beams.stamp_ns, self._seconds_to(beams), self._front_end
+        measured = None
+        if increment is not None:
+            measured = front_end.follow_odometry(increment, learned=False)
+        return self._faults.predict(measured, front_end.predict(), increment, ns, seconds)
 
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
         """The hits of a scan with weight 1, without the motion that is predicted during it.
@@ -169,7 +173,7 @@ class ScanOdometry:
             self._reckoning.move(front_end.pose, match.T_map_base, drift)
         else:
             self._reckoning.reset()
-        self._advance(beams, match.T_map_base)
+        self._advance(beams, match.T_map_base, is_slipping)
         is_contradicted = self._is_contradicted or self._is_adrift
         doubts = is_slipping, is_blind, is_carried, is_contradicted, prior.is_odometry
         T, covariance = match.T_map_base, match.covariance + self._reckoning.covariance
@@ -308,10 +312,9 @@ class ScanOdometry:
         is_leap = np.hypot(*twist[:2]) > MAX_SPEED or abs(twist[2]) > MAX_TURN_RATE
         return np.zeros(3) if is_leap else twist
 
-    def _advance(self, beams: ScanBeams, T: Float) -> None:
+    def _advance(self, beams: ScanBeams, T: Float, is_fault: bool) -> None:
         if not self._is_first:
             seconds = self._seconds_to(beams)
             self._seconds = seconds if self._seconds == 0.0 else 0.9 * self._seconds + 0.1 * seconds
-        metres = self._front_end.advance(T, is_first=self._is_first)
-        self.travelled += 0.0 if self._is_first else metres
+        self.travelled += self._front_end.advance(T, is_fault=is_fault, is_first=self._is_first)
         self._stamp_ns, self._is_first = beams.stamp_ns, False

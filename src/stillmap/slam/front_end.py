@@ -72,6 +72,7 @@ class FrontEnd:
         self._options = options
         self.pose, self.before = np.eye(3), np.eye(3)
         self.usual: dict[str | int, float] = {}
+        self._increment: Float | None = None  # (3, 3) of odometry to the next scan
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self.agree()
 
@@ -79,6 +80,9 @@ class FrontEnd:
         """The scans so far agree with the local map."""
         self._contradictions, self._since = 0.0, np.inf
         self.first_contradicting: int | None = None
+        # pose (3, 3) of a scan to which odometry led, and its increment (3, 3) since: to the last
+        # scan it may have been late
+        self._late: tuple[Float, Float] | None = None
 
     @property
     def is_carried(self) -> bool:
@@ -91,6 +95,7 @@ class FrontEnd:
 
     def follow_odometry(self, increment: Float, *, learned: bool) -> MotionPrior:
         """The prior after an increment (3, 3), with the noise learned so far or the largest."""
+        self._increment = increment
         noise = self._odometry_noise if learned else OdometryNoise()
         return motion_model.odometry_prior(self.pose, increment, self._options, noise)
 
@@ -129,7 +134,12 @@ class FrontEnd:
     ) -> tuple[ScanMatch, Evidence]:
         """A poor match, or one outside the prior that is more likely, and what it says."""
         usual = self.usual.get(sensor, 1.0)
-        wider = widen_match(grid, scan, prior, alternative, match, usual)
+        priors = [prior] if alternative is None else [prior, alternative]
+        if self._late is not None and self._increment is not None:
+            pose, since = self._late
+            caught_up = motion_model.odometry_prior(pose, since @ self._increment, self._options)
+            priors.append(caught_up)
+        wider = widen_match(grid, scan, priors, match, usual)
         return wider, judge_scan(grid, scan, wider, usual)
 
     def weigh(self, t: int, T_map_base: Float, seconds: float, evidence: Evidence) -> None:
@@ -180,8 +190,24 @@ class FrontEnd:
         residual = self.predict().residual(match.T_map_base)
         self._velocity_noise = self._velocity_noise.update(residual, seconds)
 
-    def advance(self, T_map_base: Float, *, is_first: bool = False) -> float:
-        """Go on to the pose (3, 3) of a scan; m of travel. The velocity at a first one is 0."""
+    def advance(
+        self, T_map_base: Float, *, is_fault: bool = False, is_first: bool = False
+    ) -> float:
+        """Go on to the pose (3, 3) of a scan; m of travel.
+
+        Args:
+            T_map_base: the pose.
+            is_fault: odometry does not lead there.
+            is_first: the velocity is 0.
+        """
+        if self._increment is None or is_first:
+            self._late = None
+        elif is_fault and self._late is not None:
+            pose, since = self._late
+            self._late = pose, since @ self._increment
+        else:
+            self._late = self.pose, self._increment
+        self._increment = None
         self.before = T_map_base if is_first else self.pose
         metres = float(np.hypot(*(T_map_base[:2, 2] - self.pose[:2, 2])))
         self.pose = T_map_base

@@ -56,10 +56,8 @@ class LocalMap:
     def remove_before(self, travelled: float) -> None:
         """Removes the scans taken before that many metres of travel."""
         while self._kept and self._kept[0][2] < travelled:
-            self._remove(*self._kept.popleft())
-
-    def _remove(self, t: int, T_map_base: Float, _: float) -> None:
-        add_scan(self.grid, self._recording, self._e, t, T_map_base, remove=True)
+            t, T_map_base, _ = self._kept.popleft()
+            add_scan(self.grid, self._recording, self._e, t, T_map_base, remove=True)
 
     def _is_spaced(self, t: int, T_map_base: Float) -> bool:
         kept = self._last_of(self._recording.sensor[t])

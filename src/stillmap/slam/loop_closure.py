@@ -77,8 +77,7 @@ def close_loops(
     for first, last in loop_candidates.split_stages(context):
         progress(int(context.keyframes[first]), recording.n_scans)
         state = close_stage(context, chain, centers, state, first, last, len(ties))
-    poses, found = state.poses, state.found
-    poses, found = solve_graph(context.keyframes, chain, poses, found, _MAX_CHI2)
+    poses, found = solve_graph(context.keyframes, chain, state.poses, state.found, _MAX_CHI2)
     accepted = accepted_constraints(context.keyframes, found)
     graph = PoseGraph(context.keyframes, poses, [*chain, *accepted])
     graph = align_headings(recording, e, graph, odometry.covariance)

@@ -194,6 +194,7 @@ def _merge_scans(scans: list[Scan], to_t: Float) -> Scan:
         scans[0].T_base_sensor,
         np.concatenate([np.float32(scan.normals @ T[:2, :2].T) for scan, T in pairs]),
         np.concatenate([scan.isotropy for scan in scans]),
+        np.concatenate([scan.shares for scan in scans]),
     )
 
 

@@ -104,7 +104,6 @@ def _motion_steps(
 StepProgress = Callable[[str, int, int], None]  # step, scans done, total; 0: not counted
 
 _LOCAL_MAP_TRAVEL = 25.0  # m after which scans leave the local map if loops are closed afterwards
-_REFINEMENT_PASSES = 1
 
 
 def m_step(
@@ -225,10 +224,8 @@ class _PoseStep:
         return self._refine(closed, self._progress("refining poses"))
 
     def _refine(self, initial: MStepResult, progress: ScanProgress) -> MStepResult:
-        refined = initial
-        for _ in range(_REFINEMENT_PASSES):
-            deskewed = self._deskew(refined.poses)
-            refined = refine_poses(deskewed, self.e, self.options, refined, progress)
+        deskewed = self._deskew(initial.poses)
+        refined = refine_poses(deskewed, self.e, self.options, initial, progress)
         # a misregistered scan agrees with a map that contains it: keep the share from the local map
         return dataclasses.replace(refined, explained=initial.explained)
 

@@ -120,11 +120,12 @@ class _ScanOdometry:
         if poor and self.search_wider:
             match, evidence = front_end.search_wider(grid, scan, s, prior, alternative, match)
         front_end.weigh(t, match.T_map_base, seconds, evidence)
-        self._record(t, match, is_fault=self._rejects_odometry(t, prior, alternative, match))
+        is_fault = self._contradicts_odometry(t, match.T_map_base)
+        self._record(t, match, is_fault=is_fault)
         self._note_drift(t, motion, match, seconds)
         if is_seen:
             front_end.learn(s, motion, match, self.seconds)
-        self.travelled += front_end.advance(match.T_map_base)
+        self.travelled += front_end.advance(match.T_map_base, is_fault=is_fault)
         if evidence is not Evidence.CONTRADICTS:
             self.local_map.add(t, match.T_map_base, self.travelled)
         self.local_map.remove_before(self.travelled - self.max_travel)
@@ -150,13 +151,12 @@ class _ScanOdometry:
             return guess, None, measured
         return measured, self.front_end.follow_odometry(increment, learned=True), guess
 
-    def _rejects_odometry(
-        self, t: int, prior: MotionPrior, alternative: MotionPrior | None, match: ScanMatch
-    ) -> bool:
-        """True if odometry was not the prior of scan t, and leaps or contradicts its match."""
-        if self.steps is None or prior.is_odometry or alternative is None:
+    def _contradicts_odometry(self, t: int, T_map_base: Float) -> bool:
+        """True if odometry leaps before scan t, or does not lead to its pose (3, 3)."""
+        if self.steps is None:
             return False
-        return not self.steps.plausible[t - 1] or is_inconsistent(alternative, match.T_map_base)
+        measured = self.front_end.follow_odometry(self.steps.increments[t - 1], learned=False)
+        return not self.steps.plausible[t - 1] or is_inconsistent(measured, T_map_base)
 
     def _start_segment(self, t: int, prior: MotionPrior) -> None:
         """Starts a new local map where the prior leads: loop closure decides where it belongs."""
@@ -172,7 +172,7 @@ class _ScanOdometry:
     def _record(self, t: int, match: ScanMatch, *, is_fault: bool) -> None:
         self.poses[t], self.covariance[t] = match.T_map_base, match.covariance
         self.explained[t], self.widened[t] = match.explained, match.widened
-        self.odometry_faults[t] = match.contradicts_odometry or is_fault
+        self.odometry_faults[t] = is_fault
         self.possible_faults[t] = match.may_be_fault
 
     def _note_drift(self, t: int, prior: MotionPrior, match: ScanMatch, seconds: float) -> None:

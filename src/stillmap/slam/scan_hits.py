@@ -19,6 +19,8 @@ INTERPOLATION = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
 # normals of a scan: m to either side that belong to one surface, m between its end points; ratio of
 # the variances across and along up to which it is flat, and from which it is a corner
 NORMALS = {"radius": 0.3, "max_gap": 1.0, "flat_below": 0.1, "round_from": 0.4}
+# m of a surface along which end points share their errors: what is near has no more evidence
+CORRELATION_LENGTH = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +29,11 @@ class Scan:
 
     Attributes:
         points: (N, 2) float32, end points in the base frame.
-        weights: (N,) float32, e.
+        weights: (N,) float32, e times the shares.
         T_base_sensor: (3, 3) origin of the beams.
         normals: (N, 2) float32, of the surfaces.
         isotropy: (N,) float32, 0 on a flat surface, 1 where an end point fixes both directions.
+        shares: (N,) float32, of evidence, that is the end point's own.
     """
 
     points: Float32
@@ -38,6 +41,11 @@ class Scan:
     T_base_sensor: Float
     normals: Float32
     isotropy: Float32
+    shares: Float32
+
+    def weighted(self, e: Float32) -> "Scan":
+        """The same with e (N,)."""
+        return replace(self, weights=e * self.shares)
 
 
 def transform_points(points: Float32, T: Float) -> Float32:
@@ -57,13 +65,20 @@ def select_hits(
 
 
 def make_scan(
-    points: Float32, weights: Float32, T_base_sensor: Float, normals: Mapping[str, float] = NORMALS
+    points: Float32, e: Float32, T_base_sensor: Float, normals: Mapping[str, float] = NORMALS
 ) -> Scan:
-    """A scan of end points (N, 2) in the order of the beams, with the normals of its surfaces."""
-    n, isotropy = np.zeros_like(points), np.zeros_like(weights)
-    counts = weights > 0.0
+    """A scan of end points (N, 2) with e (N,), in the order of the beams, and its normals."""
+    n, isotropy, shares = np.zeros_like(points), np.zeros_like(e), np.zeros_like(e)
+    counts = e > 0.0
     n[counts], isotropy[counts] = _core.estimate_normals(points[counts], **normals)
-    return Scan(points, weights, T_base_sensor, n, isotropy)
+    shares[counts] = evidence_shares(points[counts])
+    return Scan(points, e * shares, T_base_sensor, n, isotropy, shares)
+
+
+def evidence_shares(points: Float32) -> Float32:
+    """(N,) shares of the evidence of end points (N, 2), in the order of the beams, that they do not
+    have in common with their neighbours."""
+    return _core.evidence_shares(points, correlation_length=CORRELATION_LENGTH)
 
 
 def add_scan(
@@ -117,9 +132,10 @@ def count_beams(
     grid = _core.OccupancyGrid2D(resolution, moments=False)
     for t, pose in zip(recording.iter_scans(scans, e), poses, strict=True):
         beams = recording.beams_of(t)
-        points, hit = recording.points[beams], recording.hit[beams]
+        points, hit, weights = recording.points[beams], recording.hit[beams], e[beams].copy()
+        weights[hit] *= evidence_shares(points[hit])
         T = pose @ recording.T_base_sensor[recording.sensor[t]]
-        _core.add_beams(grid, points, hit, e[beams], np.array([0, len(hit)]), T[None])
+        _core.add_beams(grid, points, hit, weights, np.array([0, len(hit)]), T[None])
     return grid
 
 

@@ -5,8 +5,8 @@ Likelihood field around end points, correlative search, Newton refinement; what 
 """
 
 import dataclasses
-import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,8 @@ from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.scan_hits import NORMALS, Scan
 
 # likelihood field: m, std around end points; value of an unexplained end point; value added in
-# unknown space, which is not free; weight of one beam against the motion prior
-_FIELD_STD, _FLOOR, _UNKNOWN, INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
+# unknown space, which is not free; weight of an end point with evidence of its own
+_FIELD_STD, _FLOOR, _UNKNOWN, INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.4
 _MAX_ITERATIONS = 20  # Newton
 _MAX_SEARCH_RANGE = 20.0  # m; longer beams are left out of the correlative search
 _MAX_CANDIDATES = 3  # poses of the correlative search that are refined
@@ -134,8 +134,7 @@ def compare_priors(
 def widen_match(
     grid: _core.OccupancyGrid2D,
     scan: Scan,
-    prior: MotionPrior,
-    alternative: MotionPrior | None,
+    priors: Sequence[MotionPrior],
     match: ScanMatch,
     usual: float,
 ) -> ScanMatch:
@@ -144,24 +143,24 @@ def widen_match(
     Args:
         grid: the map so far.
         scan: its hits, at least one.
-        prior: as of `match_scan`.
-        alternative: a second prior.
-        match: a poor match within the prior.
+        priors: as of `match_scan`, and others if it fails.
+        match: a poor match within the first one.
         usual: recent average of the explained share.
     """
     threshold = _WIDEN_BELOW * usual
-    cost = match.cost + motion_cost(prior, match)
-    for mean, window in itertools.product((prior, alternative), _WIDE_WINDOWS):
-        if mean is None or match.explained >= threshold:
-            continue
-        wide = motion_model.widen_prior(mean, *(half / _SEARCH_STDS for half in window))
-        wider = search_within_prior(grid, scan, wide)
-        cost_of_fault = wider.cost + motion_cost(wide, wider) + FAULT_COST
-        # at a place that only looks alike, beams would pass through walls
-        is_alike = occluded_share(grid, scan, wider.T_map_base) > MAX_OCCLUDED
-        if cost_of_fault < cost and not is_alike:
-            match, cost = dataclasses.replace(wider, widened=True), cost_of_fault
-    return _loosen_prior(grid, scan, prior, match)
+    cost = match.cost + motion_cost(priors[0], match)
+    for n_faults, window in enumerate(_WIDE_WINDOWS, start=1):
+        for prior in priors:
+            wide = motion_model.widen_prior(prior, *(half / _SEARCH_STDS for half in window))
+            wider = search_within_prior(grid, scan, wide)
+            cost_of_fault = wider.cost + motion_cost(wide, wider) + n_faults * FAULT_COST
+            # at a place that only looks alike, beams would pass through walls
+            is_alike = occluded_share(grid, scan, wider.T_map_base) > MAX_OCCLUDED
+            if cost_of_fault < cost and not is_alike:
+                match, cost = dataclasses.replace(wider, widened=True), cost_of_fault
+        if match.explained >= threshold:
+            break
+    return _loosen_prior(grid, scan, priors[0], match)
 
 
 def _loosen_prior(
@@ -303,7 +302,8 @@ def refinement_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
     """Options of the kernel that refines one scan after another."""
     normals = {"normal_radius": NORMALS["radius"], "normal_max_gap": NORMALS["max_gap"]}
     flat = {name: NORMALS[name] for name in ("flat_below", "round_from")}
-    return {**_newton_options(grid), **scan_hits.INTERPOLATION, **normals, **flat}
+    shared = {"correlation_length": scan_hits.CORRELATION_LENGTH}
+    return {**_newton_options(grid), **scan_hits.INTERPOLATION, **normals, **flat, **shared}
 
 
 def _newton_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:

@@ -227,9 +227,10 @@ def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
 
 def _range_signature(context: LoopContext, t: int) -> Float:
     """(24,) cumulative range histogram of a scan, which is invariant to rotation."""
-    scan = context.hits(t)
-    ranges = np.linalg.norm(scan.points, axis=1)
-    total = np.histogram(ranges, _RANGE_BINS, weights=scan.weights)[0].cumsum()
+    recording, beams = context.recording, context.recording.beams_of(t)
+    hit = recording.hit[beams]
+    ranges = np.linalg.norm(context.hits(t).points, axis=1)
+    total = np.histogram(ranges, _RANGE_BINS, weights=context.e[beams][hit])[0].cumsum()
     shares: Float = total / max(float(total[-1]), 1e-9)
     return shares
 

@@ -35,6 +35,7 @@ struct RefinementOptions {
   ScanRegistrationOptions registration;
   InterpolationOptions interpolation;
   NormalOptions normals;
+  double correlation_length;  // metres, see evidence_shares
   MotionStep no_motion;  // prior about its own pose of a scan without a known step to either side
 };
 
@@ -76,7 +77,7 @@ inline void add_hits(OccupancyGrid<2>& grid, const ScanBeams& scan, const Pose<2
 }
 
 // The hits of a scan with their normals, in the base frame.
-inline WeightedBeams collect_hits(const ScanBeams& scan, const NormalOptions& options) {
+inline WeightedBeams collect_hits(const ScanBeams& scan, const RefinementOptions& options) {
   WeightedBeams beams;
   for (int64_t n = 0; n < scan.n_beams; ++n) {
     if (!scan.hit[n] || !usable<2>(scan.points + 2 * n) || !(scan.e[n] > 0.0f)) continue;
@@ -84,7 +85,9 @@ inline WeightedBeams collect_hits(const ScanBeams& scan, const NormalOptions& op
     beams.points.emplace_back(point.cast<float>().cast<double>());  // as `Scan` stores them
     beams.weights.push_back(checked_probability(scan.e[n]));
   }
-  beams.normals = estimate_normals(beams.points, options);
+  beams.normals = estimate_normals(beams.points, options.normals);
+  const auto shares = evidence_shares(beams.points, options.correlation_length);
+  for (size_t n = 0; n < shares.size(); ++n) beams.weights[n] *= shares[n];
   return beams;
 }
 
@@ -118,7 +121,7 @@ inline std::vector<ScanRegistrationResult> refine_scans(OccupancyGrid<2>& grid,
     const ScanBeams scan = beams_of(scans, e, t);
     Pose<2>& here = poses[t + 1];
     if (is_in_map[t]) add_hits(grid, scan, here, -1, options.interpolation);
-    WeightedBeams beams = collect_hits(scan, options.normals);
+    WeightedBeams beams = collect_hits(scan, options);
     const PosePrior prior =
         neighbour_prior(poses[t], here, poses[t + 2], steps[t], steps[t + 1], options.no_motion);
     LikelihoodField field(grid, options.registration.field);

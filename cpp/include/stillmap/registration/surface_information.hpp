@@ -82,6 +82,21 @@ inline std::vector<SurfaceNormal> estimate_normals(const std::vector<Vec<2>>& po
   return out;
 }
 
+// Shares of evidence that the end points of a planar scan, in the order of the beams, do not have
+// in common with their neighbours: half for each side on which the neighbour is a correlation
+// length (metres) away or farther, and less for a nearer one.
+inline std::vector<double> evidence_shares(const std::vector<Vec<2>>& points,
+                                           double correlation_length) {
+  std::vector<double> shares(points.size(), 1.0);
+  for (size_t n = 1; n < points.size(); ++n) {
+    const double distance = (points[n] - points[n - 1]).norm();
+    const double common = 0.5 * (1.0 - std::min(distance / correlation_length, 1.0));
+    shares[n - 1] -= common;
+    shares[n] -= common;
+  }
+  return shares;
+}
+
 // Information of one end point about the pose, for a lever arm R p and a surface in the moving
 // frame; to be scaled by the inverse variance of the end point.
 inline Eigen::Matrix3d endpoint_information(const Vec<2>& lever, const Vec<2>& normal,
