@@ -75,7 +75,8 @@ auto normals_of(const Points<2>& points, double radius, double max_gap, double f
   require(radius > 0.0 && max_gap > 0.0, "radius, max_gap: expected positive lengths");
   require(flat_below >= 0.0 && round_from > flat_below,
           "round_from: expected more than flat_below, which must not be negative");
-  const auto found = estimate_normals(end_points(points), {radius, max_gap, flat_below, round_from});
+  const auto found =
+      estimate_normals(end_points(points), {radius, max_gap, flat_below, round_from});
   std::vector<float> normals, isotropy;
   for (const auto& surface : found) {
     for (const double x : {surface.normal[0], surface.normal[1]})
@@ -232,11 +233,12 @@ void bind_scan_registration(nb::module_& m) {
         "within `radius` metres, each at most `max_gap` from the one before. Isotropy rises from 0 "
         "to 1 as the ratio of the variances across and along rises from flat_below to round_from. "
         "With fewer than two neighbours the normal is zero.");
-  m.def("evidence_shares", &shares_of, nb::arg("points").noconvert(), nb::kw_only(),
-        nb::arg("correlation_length"),
-        "Shares of evidence (N,) float32, in [0, 1], that the end points (N, 2) of a planar scan in "
-        "the order of its beams do not have in common with their neighbours: half for each side on "
-        "which the neighbour is `correlation_length` metres away, and less for a nearer one.");
+  m.def(
+      "evidence_shares", &shares_of, nb::arg("points").noconvert(), nb::kw_only(),
+      nb::arg("correlation_length"),
+      "Shares of evidence (N,) float32, in [0, 1], that the end points (N, 2) of a planar scan in "
+      "the order of its beams do not have in common with their neighbours: half for each side on "
+      "which the neighbour is `correlation_length` metres away, and less for a nearer one.");
   bind_registration(m);
   bind_occluded_share<2>(m);
   bind_occluded_share<3>(m);
