@@ -29,7 +29,6 @@ _FILES = {
     "objects/objects.json": "moving objects and their tracks",
     "traffic.npz": "how often each square was crossed",
     "beams/p_static.npy": "probability of every beam to be static",
-    "run.json": "record of this run",
 }
 _NO_MORE: Mapping[str, str] = {}
 
@@ -85,4 +84,5 @@ def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[
     if folder is None:
         return []
     known = {**more, **_FILES, **more}
-    return [(name, what) for name, what in known.items() if (folder / name).is_file()]
+    there = [(name, what) for name, what in known.items() if (folder / name).is_file()]
+    return [*there, ("run.json", "record of this run")]  # which is written last
