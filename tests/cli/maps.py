@@ -1,6 +1,4 @@
-"""Arguments and outputs of `stillmap map` for tests."""
-
-from result_contents import FILES as FILES
+"""Arguments of `stillmap map` for tests."""
 
 QUICK = ("--set", "em.max_iterations=1")
 TWO_ITERATIONS = ("--set", "em.max_iterations=2", "--set", "em.patience=9")

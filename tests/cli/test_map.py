@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import yaml
 from flat import list_files
-from maps import FILES, QUICK
+from maps import QUICK
 from refusals import refused
+from result_contents import FILES
 
 from stillmap.core.recording import Recording
 from stillmap.core.source import SensorNotes, Source

@@ -7,8 +7,9 @@ import shutil
 
 import pytest
 from flat import list_files
-from maps import FILES, QUICK, TWO_ITERATIONS
+from maps import QUICK, TWO_ITERATIONS
 from refusals import refused
+from result_contents import FILES
 
 import stillmap.results.writer
 

@@ -9,7 +9,8 @@ import time
 
 import pytest
 from flat import list_files
-from maps import ENDLESS, FILES, QUICK
+from maps import ENDLESS, QUICK
+from result_contents import FILES
 
 STILLMAP = shlex.join([sys.executable, "-m", "stillmap"])
 

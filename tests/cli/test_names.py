@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 from flat import list_files
-from maps import FILES, QUICK
+from maps import QUICK
+from result_contents import FILES
 
 NAME = os.fsdecode(b"h\xe4ll")  # of Latin-1
 PLAIN = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

@@ -8,7 +8,8 @@ import sys
 
 import pytest
 from flat import list_files
-from maps import FILES, QUICK
+from maps import QUICK
+from result_contents import FILES
 
 import stillmap
 

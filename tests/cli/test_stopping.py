@@ -7,7 +7,8 @@ import time
 
 import pytest
 from flat import list_files
-from maps import ENDLESS, FILES, QUICK
+from maps import ENDLESS, QUICK
+from result_contents import FILES
 
 
 def test_closed_stderr_during_progress(start, room, tmp_path):

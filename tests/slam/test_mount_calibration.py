@@ -91,7 +91,7 @@ def test_what_is_told_stays():
 def test_odometry(errors, name, value):
     found = calibrate_mounts(with_odometry(**errors), RESOLUTION)
     assert significant(found) == {name}
-    assert found.odometry[name].value == pytest.approx(value, abs=0.04)
+    assert found.odometry[name].value == pytest.approx(value, abs=0.03)
 
 
 @pytest.mark.parametrize("latency", [2.0, -1.5])

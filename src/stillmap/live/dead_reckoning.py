@@ -84,7 +84,7 @@ class DeadReckoning:
         information = np.asarray(np.linalg.inv(covariance), np.float64)
         wide = MotionPrior(prior.T_map_base, information, metres, radians)
         # labels at a pose that is wrong would take walls for people
-        unlabelled = scan.weighted(np.ones_like(scan.shares))
+        unlabelled = scan.reweight(np.ones_like(scan.shares))
         match = scan_matching.search_within_prior(grid, unlabelled, wide)
         evidence = judge_scan(grid, unlabelled, match, usual)
         if evidence is Evidence.CONTRADICTS:

@@ -73,7 +73,7 @@ class RivalMotion:
         std = _STANDING_STD if self.stands else (guess.translation_std, guess.rotation_std)
         prior = gaussian_prior(self.pose @ self.step, *std)
         # labels that follow from the pose by odometry would leave out what contradicts it
-        unlabelled = scan.weighted(np.ones_like(scan.shares))
+        unlabelled = scan.reweight(np.ones_like(scan.shares))
         match = refine_pose(grid, unlabelled, prior, prior.T_map_base)
         # by end points alone: the local map is smeared along a motion that was none, and beams of
         # a robot that stands seem to pass through it

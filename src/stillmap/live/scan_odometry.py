@@ -46,7 +46,7 @@ def thin(hits: Scan) -> Scan:
     names = ("points", "weights", "normals", "isotropy")
     thinned = {name: np.ascontiguousarray(getattr(hits, name)[every]) for name in names}
     shares = scan_hits.evidence_shares(thinned["points"])
-    return replace(hits, **thinned, shares=shares).weighted(thinned["weights"])
+    return replace(hits, **thinned, shares=shares).reweight(thinned["weights"])
 
 
 class WallDirections:
@@ -117,10 +117,8 @@ class ScanOdometry:
         if self._is_first:
             return motion_model.gaussian_prior(self._front_end.pose, 1e-3, 1e-3)
         ns, seconds, front_end = beams.stamp_ns, self._seconds_to(beams), self._front_end
-        measured = None
-        if increment is not None:
-            measured = front_end.follow_odometry(increment, learned=False)
-        return self._faults.predict(measured, front_end.predict(), increment, ns, seconds)
+        prior = None if increment is None else front_end.follow_odometry(increment, learned=False)
+        return self._faults.predict(prior, front_end.predict(), increment, ns, seconds)
 
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
         """The hits of a scan with weight 1, without the motion that is predicted during it.

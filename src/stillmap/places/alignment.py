@@ -118,8 +118,8 @@ class _Search:
         cells -= np.where(cells >= self._inside, self._shape, 0)  # shifts to the other side
         xy = (cells + self._half) * self.cell + self._low
         values = score.ravel()[at].tolist()
-        found = zip(values, xy.tolist(), strict=True)
-        return [_Optimum(value, x, y, heading) for value, (x, y) in found]
+        optima = zip(values, xy.tolist(), strict=True)
+        return [_Optimum(value, x, y, heading) for value, (x, y) in optima]
 
     def _rotate_field(self, heading: float) -> Raster:
         """The session's field on cells about its middle; 0 where nothing is known."""

@@ -80,8 +80,8 @@ class FrontEnd:
         """The scans so far agree with the local map."""
         self._contradictions, self._since = 0.0, np.inf
         self.first_contradicting: int | None = None
-        # pose (3, 3) of a scan to which odometry led, and its increment (3, 3) since: to the last
-        # scan it may have been late
+        # pose (3, 3) from which odometry is valid if it was late at the scans since, the last one
+        # at least, and its increment (3, 3) since
         self._late: tuple[Float, Float] | None = None
 
     @property
@@ -94,7 +94,8 @@ class FrontEnd:
         return motion_model.constant_velocity_prior(self.pose, self.before, self._velocity_noise)
 
     def follow_odometry(self, increment: Float, *, learned: bool) -> MotionPrior:
-        """The prior after an increment (3, 3), with the noise learned so far or the largest."""
+        """The prior of the next scan after an increment (3, 3), which is kept until `advance`, with
+        the noise learned so far or the largest."""
         self._increment = increment
         noise = self._odometry_noise if learned else OdometryNoise()
         return motion_model.odometry_prior(self.pose, increment, self._options, noise)
@@ -137,8 +138,7 @@ class FrontEnd:
         priors = [prior] if alternative is None else [prior, alternative]
         if self._late is not None and self._increment is not None:
             pose, since = self._late
-            caught_up = motion_model.odometry_prior(pose, since @ self._increment, self._options)
-            priors.append(caught_up)
+            priors += [motion_model.odometry_prior(pose, since @ self._increment, self._options)]
         wider = widen_match(grid, scan, priors, match, usual)
         return wider, judge_scan(grid, scan, wider, usual)
 

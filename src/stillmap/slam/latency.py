@@ -15,7 +15,7 @@ from stillmap.slam.scan_hits import select_beams
 from stillmap.slam.trajectory_cost import OdometryCost
 
 MAX_LATENCY = 3.0  # s, early or late, that is tried
-_STEPS = 0.25, 0.05, 0.01  # s, of one grid after the other around the best
+_STEPS = 0.25, 0.05, 0.01  # s, of one grid after the other around the best, then a parabola
 _MAX_SCANS = 1000  # that are matched: those of the stretch with the most rotation
 _ROUNDS = 6  # of matching and fitting, at most
 _MAX_TRAVEL = 25.0  # m after which they leave the local map
@@ -69,11 +69,13 @@ def _fit_to_poses(recording: Recording, poses: Float, options: SlamOptions) -> L
     for step in _STEPS:
         tried = best + step * np.arange(-round(width / step), round(width / step) + 1)
         best, width = min(tried.tolist(), key=cost), step
-    h, least = _STEPS[1], cost(best)
+    least, before, after = cost(best), cost(best - width), cost(best + width)
+    vertex = best + 0.5 * width * (before - after) / max(before + after - 2.0 * least, 1e-9)
+    h = _STEPS[1]
     curvature = (cost(best - h) + cost(best + h) - 2.0 * least) / h**2
     if abs(best) >= MAX_LATENCY or curvature <= 0.0:
         return LatencyFit()
-    return LatencyFit(best, curvature**-0.5, cost(0.0) - least)
+    return LatencyFit(vertex, curvature**-0.5, cost(0.0) - least)
 
 
 def shift_odometry(recording: Recording, latency: float) -> Recording:

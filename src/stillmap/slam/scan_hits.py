@@ -33,7 +33,7 @@ class Scan:
         T_base_sensor: (3, 3) origin of the beams.
         normals: (N, 2) float32, of the surfaces.
         isotropy: (N,) float32, 0 on a flat surface, 1 where an end point fixes both directions.
-        shares: (N,) float32, of evidence, that is the end point's own.
+        shares: (N,) float32 in [0, 1], see `evidence_shares`.
     """
 
     points: Float32
@@ -43,8 +43,8 @@ class Scan:
     isotropy: Float32
     shares: Float32
 
-    def weighted(self, e: Float32) -> "Scan":
-        """The same with e (N,)."""
+    def reweight(self, e: Float32) -> "Scan":
+        """The same hits with other P(static) e (N,)."""
         return replace(self, weights=e * self.shares)
 
 
@@ -76,8 +76,8 @@ def make_scan(
 
 
 def evidence_shares(points: Float32) -> Float32:
-    """(N,) shares of the evidence of end points (N, 2), in the order of the beams, that they do not
-    have in common with their neighbours."""
+    """(N,) in [0, 1]: how much of the evidence of each end point (N, 2), in the order of the beams,
+    its neighbours do not have in common with it."""
     return _core.evidence_shares(points, correlation_length=CORRELATION_LENGTH)
 
 
