@@ -96,7 +96,7 @@ def test_the_map_follows_from_the_labels(room, fixed):
     assert np.isnan(e[100:110]).all()
     assert np.ptp(e[hit]) > 0.5
     assert result.mapping.changes == []
-    poses, chosen = result.poses, result.options.em
+    poses, chosen = result.mapping.near.poses, result.options.em
     again, courses = em.final_e_step(recording, poses, m.resolution, chosen, threads=2)
     noise_std = courses.surfel_map.noise_std
     given_tracks, _ = apply_motion_evidence(result.deskewed, poses, again.p_static, noise_std)

@@ -105,30 +105,31 @@ def test_labels_are_those_of_the_map_shown():
 
 
 def test_what_is_not_listed_stays_what_it_is_without_changes():
-    result, without = built(), built(changes=False)
+    result, without = built().mapping.near, built(changes=False).mapping.near
     scans, poses = result.deskewed, result.poses
     _, courses = em.final_e_step(scans, poses, result.map.resolution, result.options.em)
-    cells = {tuple(cell) for one in result.mapping.changes for cell in one.cells.tolist()}
+    cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
     beams = scans.points, scans.hit, scans.offset, scans.T_map_sensor(poses)
     element = courses.surfel_map.associate_beams(*beams)
     of_cells = np.array([tuple(cell) in cells for cell in courses.cells.tolist()])
     there = (element >= 0) & of_cells[element]
     assert 0.01 < there.mean() < 0.3
-    pooled = pool_states(courses, result.mapping.changes, "last")
+    pooled = pool_states(courses, result.changes, "last")
     shown = courses.p_in_map("last", pooled)[element]
     on_leaf = np.zeros(len(courses.cells), bool)
-    for leaf in (swing().door.open_cells, swing().door.shut_cells):
+    (door,) = [change.door for change in result.changes if change.kind == "door"]
+    for leaf in (door.open_cells, door.shut_cells):
         on_leaf |= np.isin(cell_keys(courses.cells), cell_keys(leaf))
     there |= (element >= 0) & on_leaf[element]
     shown[on_leaf[element]] = 0.0
-    _, _, p_leaf = find_shown_cells(courses, result.mapping.changes, "last")
+    _, _, p_leaf = find_shown_cells(courses, result.changes, "last")
     shown *= 1.0 - p_leaf[element]
     noise_std = courses.surfel_map.noise_std
     others, _ = apply_motion_evidence(scans, poses, without.p_static, noise_std)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))
     assert (result.p_static != without.p_static).mean() > 0.01
     assert result.learned == {**without.learned, "changing": round(courses.changing_weight, 6)}
-    assert without.mapping.changes == []
+    assert without.changes == []
     assert "changing" not in without.learned
 
 

@@ -21,8 +21,8 @@ Fields = Mapping[type, Mapping[str, str]]
 FAR = 1e4  # m, beyond which coordinates are shifted
 
 
-def find_origin(poses: Float) -> Float:
-    """(3,) origin of a local frame; zero, unless poses (T, D+1, D+1) are far from their origin.
+def find_origin(poses: Float, min_distance: float = 0.0) -> Float:
+    """(3,) origin of a local frame of poses (T, D+1, D+1); 0: most are within `min_distance`, m.
 
     The first pose that is near most of the others, so that the same robot elsewhere sees the same
     cells: a receiver may state zeros until it knows where it is.
@@ -32,7 +32,7 @@ def find_origin(poses: Float) -> Float:
     positions = positions[np.isfinite(positions).all(axis=1)]
     if len(positions):
         middle = np.median(positions, axis=0)
-        if np.abs(middle).max() > FAR:
+        if np.abs(middle).max() >= min_distance:
             apart = np.abs(positions - middle).max(axis=1)
             first = np.argmax(apart <= max(FAR, float(np.median(apart))))
             origin[:dimension] = positions[first]

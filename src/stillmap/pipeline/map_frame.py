@@ -12,7 +12,7 @@ import numpy as np
 from stillmap import em, slam
 from stillmap.core.array_types import Float
 from stillmap.core.grid_map import GridMap
-from stillmap.core.local_frame import Fields, Shift, find_origin, shift, shift_poses
+from stillmap.core.local_frame import FAR, Fields, Shift, find_origin, shift, shift_poses
 from stillmap.core.recording import Recording
 from stillmap.em.types import CellProbabilities, ChangedCells, NoReturnModel
 from stillmap.io.point_cloud.clouds import cloud_origin
@@ -30,7 +30,7 @@ Result = TypeVar("Result")
 def enter_local_frame(
     recording: Recording, poses: Float | None
 ) -> tuple[Float, Float, Recording, Float | None]:
-    """A recording and poses to keep, in a frame near the robot; themselves where they are near.
+    """A recording and poses to keep, in a frame that begins near the robot: at its first pose.
 
     Args:
         recording: T scans.
@@ -43,7 +43,7 @@ def enter_local_frame(
     """
     odometry = np.zeros(3)
     if recording.T_odom_base is not None:
-        odometry = find_origin(recording.T_odom_base)
+        odometry = find_origin(recording.T_odom_base, FAR)
         recording = move_odometry(recording, -odometry)
     if poses is None:
         return cloud_origin(recording), odometry, recording, None

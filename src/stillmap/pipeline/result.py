@@ -149,8 +149,8 @@ def map_recording(
     """Maps a recording: EM until the bound stops improving, then maps, changes and objects.
 
     First, sweeps without beam times get some where they are distorted, and without given poses,
-    mounts of the lasers and errors of odometry are calibrated. What is far from the origin of the
-    map frame is computed in a frame near the robot.
+    mounts of the lasers and errors of odometry are calibrated. All is computed in a frame near the
+    robot, the one of the first scan where poses are estimated.
 
     Args:
         recording, options, poses, progress, stages, scratch: see `stillmap.iterate`.

@@ -10,7 +10,7 @@ from stillmap.core import se2
 from stillmap.core.array_folder import open_npy
 from stillmap.core.array_types import Float
 from stillmap.core.errors import InputError
-from stillmap.core.local_frame import Shift, find_origin, shift, shift_poses
+from stillmap.core.local_frame import FAR, Shift, find_origin, shift, shift_poses
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import is_rigid, read_tum
 from stillmap.pipeline.map_frame import FIELDS
@@ -47,7 +47,7 @@ class NearResult(ShortRepr):
         noted = np.zeros(3)
         if (folder / RECORD).is_file():
             noted = ResultFolder(folder, read_run(folder)).read_origin()
-        near = cls(folder, noted if noted.any() else find_origin(poses))
+        near = cls(folder, noted if noted.any() else find_origin(poses, FAR))
         if not (np.abs(near.take(poses)) < MAX_DISTANCE).all():
             where = str(folder / RECORD)
             raise InputError("local_origin is far from its trajectory", where=where)

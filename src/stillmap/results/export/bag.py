@@ -9,7 +9,7 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Int64
 from stillmap.core.grid_map import limit_hits
-from stillmap.core.local_frame import find_origin, shift_poses
+from stillmap.core.local_frame import FAR, find_origin, shift_poses
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.ros import message_fields as ros
@@ -66,7 +66,7 @@ def write(
     encoder = LaserScanEncoder(recording) if recording.dimension == 2 else None
     seen = recording if recording.dimension == 2 else result.deskewed
     with writer.new_bag(path, kind, overwrite=overwrite) as bag:
-        origin = find_origin(result.poses)  # sessions of a place state none of their own
+        origin = find_origin(result.poses, FAR)  # sessions of a place state none of their own
         more = [(MAP, _LOCAL, shift_poses(np.eye(4), origin))] if origin.any() else []
         frames = writer.write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
