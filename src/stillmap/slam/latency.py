@@ -16,8 +16,9 @@ from stillmap.slam.trajectory_cost import OdometryCost
 
 MAX_LATENCY = 3.0  # s, early or late, that is tried
 _STEPS = 0.25, 0.05, 0.01  # s, of one grid after the other around the best, then a parabola
-_MAX_SCANS = 1000  # that are matched: those of the stretch with the most rotation
-_ROUNDS = 6  # of matching and fitting, at most
+# scans that are matched in each round, at most: those of the stretch with the most rotation
+_MAX_SCANS = (300, *[1000] * 5)
+_SAME = 0.05  # s, of two fits that agree
 _MAX_TRAVEL = 25.0  # m after which they leave the local map
 
 
@@ -45,15 +46,14 @@ def fit_latency(recording: Recording, p_static: float, options: SlamOptions) -> 
         p_static: of every beam.
         options: see SlamOptions.
     """
-    recording = _select_scans(recording)
-    e = np.full(recording.n_beams, p_static, np.float32)
     fit = LatencyFit()
-    for _ in range(_ROUNDS):
-        matched = register_scans(
-            shift_odometry(recording, fit.latency), e, options, lambda *_: None, _MAX_TRAVEL
-        )
-        before, fit = fit, _fit_to_poses(recording, matched.poses, options)
-        if abs(fit.latency - before.latency) <= _STEPS[-1]:
+    for max_scans in _MAX_SCANS:
+        scans = _select_scans(recording, max_scans)
+        e = np.full(scans.n_beams, p_static, np.float32)
+        shifted = shift_odometry(scans, fit.latency)
+        matched = register_scans(shifted, e, options, lambda *_: None, _MAX_TRAVEL)
+        before, fit = fit, _fit_to_poses(scans, matched.poses, options)
+        if abs(fit.latency - before.latency) <= _SAME:
             break
     return fit
 
@@ -90,12 +90,12 @@ def shift_odometry(recording: Recording, latency: float) -> Recording:
     return dataclasses.replace(recording, T_odom_base=odometry)
 
 
-def _select_scans(recording: Recording) -> Recording:
+def _select_scans(recording: Recording, max_scans: int) -> Recording:
     """The stretch in which odometry turns most, of the first laser: others may be mounted amiss."""
     assert recording.T_odom_base is not None
     scans = np.flatnonzero(recording.sensor == recording.sensor[0])
     turns = np.abs(se2.parameters(se2.increments(recording.T_odom_base[scans]))[:, 2])
-    turned, n = np.append(0.0, turns.cumsum()), min(_MAX_SCANS, len(scans))
+    turned, n = np.append(0.0, turns.cumsum()), min(max_scans, len(scans))
     first = int(np.argmax(turned[n - 1 :] - turned[: len(turned) - n + 1]))
     scans = scans[first : first + n]
     beams = [np.arange(*recording.offset[t : t + 2]) for t in scans.tolist()]

@@ -27,8 +27,6 @@ SEARCH_STDS = 2.0  # half width of the search window in standard deviations of t
 _OBSERVED_MARGIN = 1.0  # m before the end of a beam where the submap must be observed
 MIN_EXPLAINED = 0.5  # share of the comparable beams that the submap must explain
 CLOSURE_TRANSLATION, CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
-# a view is matched again while the comparable beams change by more than this share, at most
-_MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
 _SHIFTS = (-0.6, -0.3, 0.3, 0.6)  # m, to test whether a view could slide along a wall
 
 
@@ -100,13 +98,9 @@ def verify_candidate(
     view = _collect_view(context, later)
     window = SEARCH_STDS * translation_std, min(SEARCH_STDS * rotation_std, np.pi)
     grid = submap.grid
-    part, share = _select_comparable(grid, view, prior.T_map_base)
-    for _ in range(_MAX_ROUNDS):
-        match = scan_matching.search_pose(grid, part, prior, *window)
-        here, share = _select_comparable(grid, view, match.T_map_base)
-        if np.abs(here.weights - part.weights).sum() < _MAX_CHANGE * view.hits.weights.sum():
-            break
-        part = here
+    comparable, _ = _select_comparable(grid, view, prior.T_map_base)
+    match = scan_matching.search_pose(grid, comparable, prior, *window)
+    part, share = _select_comparable(grid, view, match.T_map_base)
     floor = [CLOSURE_TRANSLATION] * 2 + [CLOSURE_ROTATION]
     covariance = match.covariance + np.diag(np.square(floor))
     score, rejected = 0.0, "explains too little"

@@ -6,8 +6,9 @@ Likelihood field around end points, correlative search, Newton refinement; what 
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -51,8 +52,7 @@ class ScanMatch:
         T_map_base: (3, 3).
         covariance: (3, 3) of x, y (map frame) and heading: inverse curvature of the cost.
         explained: weighted share of the beams that the map explains, in [0, 1].
-        cost: nats, of the beams without the prior, those through walls included; with a prior of
-            odometry, of end points in unknown space no more than `_MAX_UNKNOWN_COST`.
+        compute_cost: of `cost`, as long as the map does not change.
         alternatives: (R, 4) optima of the other candidates: x, y, heading from the pose, and their
             additional cost in nats.
         widened: found only by a wider search than the prior's window.
@@ -63,11 +63,17 @@ class ScanMatch:
     T_map_base: Float
     covariance: Float
     explained: float
-    cost: float
+    compute_cost: Callable[[], float]
     alternatives: Float
     widened: bool = False
     contradicts_odometry: bool = False
     may_be_fault: bool = False
+
+    @cached_property
+    def cost(self) -> float:
+        """Nats, of the beams without the prior, those through walls included; with a prior of
+        odometry, of end points in unknown space no more than `_MAX_UNKNOWN_COST`."""
+        return self.compute_cost()
 
 
 def match_scan(
@@ -181,7 +187,7 @@ def _loosen_prior(
 def accept_prior(prior: MotionPrior) -> ScanMatch:
     """The prior's mean and covariance, for a scan without a map to match."""
     covariance = np.asarray(np.linalg.inv(prior.information), np.float64)
-    return ScanMatch(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
+    return ScanMatch(prior.T_map_base, covariance, 1.0, lambda: 0.0, np.zeros((0, 4)))
 
 
 def _match_within_prior(
@@ -263,10 +269,12 @@ def _register(
         isotropy=scan.isotropy,
         **search,
     )
-    cost += _ray_cost(grid, scan, T) - prior.cost(T)
-    if prior.is_odometry:
-        cost -= _excess_of_unknown(grid, scan, T)
-    return ScanMatch(T, covariance, explained, cost, alternatives)
+
+    def compute_cost() -> float:  # most matches are never compared
+        of_beams: float = cost + (_ray_cost(grid, scan, T) - prior.cost(T))
+        return of_beams - _excess_of_unknown(grid, scan, T) if prior.is_odometry else of_beams
+
+    return ScanMatch(T, covariance, explained, compute_cost, alternatives)
 
 
 def _ray_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
