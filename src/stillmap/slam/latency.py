@@ -18,7 +18,7 @@ MAX_LATENCY = 3.0  # s, early or late, that is tried
 _STEPS = 0.25, 0.05, 0.01  # s, of one grid after the other around the best, then a parabola
 # scans that are matched in each round, at most: those of the stretch with the most rotation
 _MAX_SCANS = (300, *[1000] * 5)
-_SAME = 0.05  # s, of two fits that agree
+_NEGLIGIBLE = 0.05  # s, half of what would be corrected
 _MAX_TRAVEL = 25.0  # m after which they leave the local map
 
 
@@ -53,7 +53,8 @@ def fit_latency(recording: Recording, p_static: float, options: SlamOptions) -> 
         shifted = shift_odometry(scans, fit.latency)
         matched = register_scans(shifted, e, options, lambda *_: None, _MAX_TRAVEL)
         before, fit = fit, _fit_to_poses(scans, matched.poses, options)
-        if abs(fit.latency - before.latency) <= _SAME:
+        change = abs(fit.latency - before.latency)
+        if abs(fit.latency) <= _NEGLIGIBLE or change <= _STEPS[-1]:
             break
     return fit
 
