@@ -93,6 +93,8 @@ def match_scan(
         learned: the same with the odometry noise learned so far. A pose outside it must fit better
             by as much as it is less likely.
     """
+    if not prior.is_odometry:  # all that is known: its mean may lie beside another optimum
+        return search_within_prior(grid, scan, prior)
     match = _match_within_prior(grid, scan, prior if learned is None else learned, usual)
     if learned is not None and len(scan.points) and is_poor(match, usual):
         wider = _match_within_prior(grid, scan, prior, usual)
@@ -127,7 +129,7 @@ def compare_priors(
     """
     if not is_inconsistent(prior, alternative.T_map_base):
         return match
-    failed = match_scan(grid, scan, alternative, usual)
+    failed = _match_within_prior(grid, scan, alternative, usual)
     if not is_inconsistent(prior, failed.T_map_base):
         return match
     cost = match.cost + motion_cost(learned or prior, match)
@@ -193,9 +195,7 @@ def accept_prior(prior: MotionPrior) -> ScanMatch:
 def _match_within_prior(
     grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, usual: float
 ) -> ScanMatch:
-    """The best pose within the prior's window; the optimum next to odometry if good enough."""
-    if not prior.is_odometry:
-        return search_within_prior(grid, scan, prior)
+    """The best pose within the prior's window; the optimum next to its mean if good enough."""
     local = refine_pose(grid, scan, prior, prior.T_map_base)
     if local.explained >= LOCAL_SHARE * usual:
         return local
