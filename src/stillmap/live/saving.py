@@ -4,6 +4,7 @@ import logging
 import os
 import shutil
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from stillmap.core.array_types import Float, Float32, Int64
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import advise, explaining_refusal
 from stillmap.core.files import require_new, resolve_output
+from stillmap.core.local_frame import FAR, find_origin
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -173,10 +175,12 @@ class Snapshot(ShortRepr):
         return replace(kept, recording=taken, submap=self.submap[scans])
 
     def _map(self, progress: Progress = no_progress, *, refine: bool = False) -> MappingResult:
-        poses, scratch = None if refine else self.poses, self.recording.scratch
-        return map_recording(
-            self.recording, self.options, poses=poses, progress=progress, scratch=scratch
-        )
+        run = partial(map_recording, progress=progress, scratch=self.recording.scratch)
+        if refine:
+            return run(self.recording, self.options)
+        # cells are those of a known map near its origin, which this one may extend
+        origin = find_origin(self.poses, FAR)
+        return run(self.recording, self.options, poses=self.poses, origin=origin)
 
     def _describe_lost(self, submaps: int, main: int) -> list[str]:
         """Warnings about scans whose pose in the map is unknown."""

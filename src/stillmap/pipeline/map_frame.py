@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 
 def enter_local_frame(
-    recording: Recording, poses: Float | None
+    recording: Recording, poses: Float | None, origin: Float | None = None
 ) -> tuple[Float, Float, Recording, Float | None]:
     """A recording and poses to keep, in a frame that begins near the robot: at its first pose.
 
@@ -36,6 +36,7 @@ def enter_local_frame(
         recording: T scans.
         poses: (T, D+1, D+1) T_map_base; None: to be estimated. The map frame is then that of the
             first scan, or of the coordinates of its clouds before they were shifted in reading.
+        origin: (3,) of the frame, with poses; None: their first one.
 
     Returns:
         the origin (3,) of the frame; that of the odometry, of which only the increments count; the
@@ -47,7 +48,7 @@ def enter_local_frame(
         recording = move_odometry(recording, -odometry)
     if poses is None:
         return cloud_origin(recording), odometry, recording, None
-    origin = find_origin(poses)
+    origin = find_origin(poses) if origin is None else origin
     return origin, odometry, recording, shift_poses(poses, -origin)
 
 

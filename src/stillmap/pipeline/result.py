@@ -140,6 +140,7 @@ def map_recording(
     options: Options = DEFAULTS,
     *,
     poses: Float | None = None,
+    origin: Float | None = None,
     progress: Progress = no_progress,
     stages: StageTimer | None = None,
     scratch: Path | None = None,
@@ -154,6 +155,7 @@ def map_recording(
 
     Args:
         recording, options, poses, progress, stages, scratch: see `stillmap.iterate`.
+        origin: (3,) m, of the frame near the robot, with poses; None: the first of them.
         resume: state of an interrupted run with the same arguments.
         checkpoint: called with the state, in the frame near the robot, after every iteration.
 
@@ -167,7 +169,7 @@ def map_recording(
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
-    origin, odometry, recording, poses = enter_local_frame(recording, poses)
+    origin, odometry, recording, poses = enter_local_frame(recording, poses, origin)
     progress("calibrating", 0, 0, 0)
     with stages.measure("calibration"):
         recording, options, calibration, notes = correct_recording(recording, options, poses)

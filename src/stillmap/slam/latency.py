@@ -53,8 +53,7 @@ def fit_latency(recording: Recording, p_static: float, options: SlamOptions) -> 
         shifted = shift_odometry(scans, fit.latency)
         matched = register_scans(shifted, e, options, lambda *_: None, _MAX_TRAVEL)
         before, fit = fit, _fit_to_poses(scans, matched.poses, options)
-        change = abs(fit.latency - before.latency)
-        if abs(fit.latency) <= _NEGLIGIBLE or change <= _STEPS[-1]:
+        if abs(fit.latency) <= _NEGLIGIBLE or abs(fit.latency - before.latency) <= _STEPS[-1]:
             break
     return fit
 
