@@ -266,4 +266,5 @@ def test_resume_after_kill(start, room, tmp_path, whole):
     _, err = process.communicate()
     assert process.returncode == 0, (err, time.monotonic() - begun)
     assert contents(tmp_path / "out") == contents(whole)
-    assert os.listdir(tmp_path) == ["out"]
+    # a process killed while it saved leaves its work, which goes after an hour
+    assert [name for name in os.listdir(tmp_path) if not name.startswith(".out.")] == ["out"]

@@ -48,7 +48,7 @@ def seen_at(ways, z=None):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_near_poses_stay_as_they_are(dimension):
     poses = poses_at(np.linspace(-1.0, 0.9 * FAR, 7 * dimension).reshape(7, dimension))
-    origin, seen = find_origin(poses), seen_at(poses[:, :-1, -1])
+    origin, seen = find_origin(poses, FAR), seen_at(poses[:, :-1, -1])
     assert not origin.any()
     assert shift_poses(poses, origin) is poses
     assert shift(seen, Shift.of(origin, 0.5), FIELDS) is seen
