@@ -18,7 +18,7 @@ Value = TypeVar("Value")
 # of a type, its fields that depend on the frame, and what each is: see `_shift_field`
 Fields = Mapping[type, Mapping[str, str]]
 
-FAR = 1e4  # m, beyond which coordinates are shifted
+FAR = 1e4  # m, from which on 32-bit floats are too coarse for coordinates
 
 
 def find_origin(poses: Float, min_distance: float = 0.0) -> Float:
