@@ -12,11 +12,7 @@ from stillmap.prepare.options import MAX_POINT_DISTANCE
 from stillmap.slam.lidar_odometry import register_sweeps
 from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_hits import (
-    beams_of_scans,
-    sees_all_round,
-    select_beams,
-)
+from stillmap.slam.scan_hits import beams_of_scans, sees_all_round, select_beams, thin_scans
 
 _RESOLUTION = 0.1  # m, of the map that scans are matched against, whatever that of the result
 _P_STATIC = 0.9  # of every return: labels are not asked
@@ -122,6 +118,7 @@ def _rematch(window: Recording, poses: Float, threads: int) -> Float:
     e = np.full(window.n_beams, _P_STATIC, np.float32)
     options = SlamOptions(resolution=_RESOLUTION)
     if window.dimension == 2:
+        window, e = thin_scans(window, e)
         # a wider search would mend poses given that jump, and agree with none of their neighbours
         matched = register_scans(window, e, options, lambda *_: None, search_wider=False).poses
         return se2.normalize(poses[0] @ se2.inverse(matched[0]) @ matched)
