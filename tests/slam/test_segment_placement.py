@@ -48,10 +48,13 @@ def test_evidence_prefers_the_right_place():
     assert 0.8 * right.score < followed.score < right.score
     far = Segment(moved(context, first, 3.0, 2.0, 0.7), first, last, 1e-4 * NARROW)
     assert not far.follow_odometry().is_likely
-    found = far.find_place()
-    assert found.is_likely
-    assert found.is_elsewhere
-    assert found.score < right.score
+    place = max(far.find_places(), key=lambda placement: placement.score)
+    assert place.is_likely
+    assert place.is_elsewhere
+    assert place.score < right.score
+    driven = far.without_odometry(place)  # it drove on from its last pose
+    assert not driven.is_elsewhere
+    assert driven.motion_cost < 15.0 < place.motion_cost
 
 
 def test_what_follows_a_segment_moves_with_it():

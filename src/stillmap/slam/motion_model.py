@@ -29,7 +29,7 @@ _INFLATION = 2.2
 _NOISE_RATE, _MIN_NOISE_SHARE, _MIN_GAIN, _MAX_INNOVATION = 0.05, 0.1, 0.1, 3.0
 # s after which a velocity that no scan corrected says nothing any more
 _VELOCITY_TIME = 5.0
-_UNIFORM_ROTATION = math.pi / math.sqrt(3.0)  # rad, std of a heading of which nothing is known
+UNIFORM_ROTATION = math.pi / math.sqrt(3.0)  # rad, std of a heading of which nothing is known
 _MAX_UNANNOUNCED = 0.15  # m and rad, upper limit of the motion that these explain
 
 
@@ -258,7 +258,7 @@ def odometry_prior(
     translation, rotation = (
         float(one * share) for one, share in zip(std, noise.inflated_shares(), strict=True)
     )
-    rotation = min(rotation, _UNIFORM_ROTATION)
+    rotation = min(rotation, UNIFORM_ROTATION)
     mean = se2.normalize(T_map_base @ increment)
     # the heading errs as a random walk along the way, which leads the robot aside
     across = np.array([T_map_base[1, 2] - mean[1, 2], mean[0, 2] - T_map_base[0, 2]])

@@ -12,7 +12,7 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float
-from stillmap.slam.segment_placement import Segment, transfer_covariance
+from stillmap.slam.segment_placement import Placement, Segment, transfer_covariance
 from stillmap.slam.types import LoopClosure, LoopContext
 
 
@@ -62,16 +62,23 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         previous, by_odometry = first, segment.follow_odometry()
         best = by_odometry
         if not best.is_likely:
-            best = max(best, segment.find_place() or best, key=lambda placement: placement.score)
-        if best.is_likely:
+            places = list(segment.find_places())
+            best = _most_likely(by_odometry, *places)
+            if not best.is_likely:
+                best = _most_likely(by_odometry, *map(segment.without_odometry, places))
+        if best.is_likely or best is not by_odometry:
             covariance = np.zeros((3, 3))
             poses[first:] = se2.normalize(best.C @ poses[first:])
             out.closures.extend(best.closures)
             if best.is_elsewhere:
                 out.breaks.append(first)
-        elif by_odometry.gain < 0.0:
+        if not best.is_likely and best.gain < 0.0:
             out.ambiguous.append(first)
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
+
+
+def _most_likely(*placements: Placement) -> Placement:
+    return max(placements, key=lambda placement: placement.score)
 
 
 # s without a scan, and times the usual ones, in which the robot may have been carried elsewhere; or

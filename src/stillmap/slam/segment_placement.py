@@ -14,7 +14,7 @@ from stillmap.core import se2
 from stillmap.core.array_types import Float, Index
 from stillmap.slam import loop_verification, scan_matching
 from stillmap.slam.loop_candidates import drift_std
-from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.motion_model import MIN_LEAP, UNIFORM_ROTATION, MotionPrior, gaussian_prior
 from stillmap.slam.trajectory_cost import same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
@@ -37,7 +37,8 @@ class Placement:
         C: (3, 3) motion of the segment from where odometry has it.
         is_matched: at least one keyframe fits there.
         gain: nats of evidence of the map of both, over that of a map of each.
-        cost: nats of the motions that lead there: errors of odometry, or a robot that was carried.
+        cost: nats of the motion of its scans.
+        motion_cost: of the motion before it: an error of odometry, or a robot that was carried.
         is_elsewhere: odometry does not lead there.
         closures: that do.
     """
@@ -46,6 +47,7 @@ class Placement:
     is_matched: bool
     gain: float
     cost: float
+    motion_cost: float = 0.0
     is_elsewhere: bool = False
     closures: list[LoopClosure] = field(default_factory=list)
 
@@ -57,7 +59,7 @@ class Placement:
     @property
     def score(self) -> float:
         """Nats by which the segment is more likely to lie there than in an unknown place."""
-        return self.gain - self.cost
+        return self.gain - self.cost - self.motion_cost
 
 
 class Segment:
@@ -84,24 +86,28 @@ class Segment:
         """The segment where odometry leads, within its covariance."""
         return self._follow(np.eye(3), self._first, self._covariance)
 
-    def find_place(self) -> Placement | None:
-        """The most likely place at which keyframes fit, near odometry or elsewhere."""
-        best: Placement | None = None
+    def find_places(self) -> Iterator[Placement]:
+        """Places at which keyframes fit, near odometry or elsewhere."""
         closures = list(self._match_places())
         for closure in self._deduplicate(closures):
             placement = self._follow(self._motion(closure), closure.later, np.zeros((3, 3)))
-            motion = self._odometry_cost(placement.C)
-            placement = dataclasses.replace(
+            motion_cost = self._odometry_cost(placement.C)
+            yield dataclasses.replace(
                 placement,
-                cost=placement.cost + min(motion, _CARRIED_COST),
-                is_elsewhere=motion > _CARRIED_COST,
+                motion_cost=min(motion_cost, _CARRIED_COST),
+                is_elsewhere=motion_cost > _CARRIED_COST,
+                closures=[same for same in closures if self._is_same(placement.C, same)],
             )
-            if best is None or placement.score > best.score:
-                best = placement
-        if best is None:
-            return None
-        same = [closure for closure in closures if self._is_same(best.C, closure)]
-        return dataclasses.replace(best, closures=same)
+
+    def without_odometry(self, placement: Placement) -> Placement:
+        """The same hypothesis if odometry failed: the robot is within reach of its last pose."""
+        context, t = self._context, self._first
+        seconds = 1e-9 * np.diff(context.recording.stamp_ns[: t + 1])
+        speed = float(context.travelled[t - 1]) / max(float(seconds[:-1].sum()), 1e-9)
+        std = max(0.5 * speed * float(seconds[-1]), MIN_LEAP)  # along an axis, of a disk
+        prior = gaussian_prior(context.poses[t - 1], std, UNIFORM_ROTATION)
+        cost = scan_matching.FAULT_COST + prior.cost(placement.C @ context.poses[t])
+        return dataclasses.replace(placement, motion_cost=cost, is_elsewhere=False)
 
     def _follow(self, C: Float, start: int, covariance: Float) -> Placement:
         """Keyframes matched with the map one after the other, from `start` on, then backwards.
