@@ -115,6 +115,7 @@ def verify_candidate(
         way = context.travelled[later] - context.travelled[earlier]
         free = _total_std(way, candidate.blind_std)[0]
         covariance += _sliding_covariance(grid, part, match.T_map_base, covariance, free)
+        covariance += _ambiguity_covariance(match.alternatives)
     return LoopClosure(
         earlier,
         later,
@@ -222,6 +223,15 @@ def _select_comparable(
     part = np.where(observed, view.hits.weights, np.float32(0.0))
     share = float(part.sum()) / max(float(view.hits.weights.sum()), 1e-9)
     return dataclasses.replace(view.hits, weights=part), share
+
+
+def _ambiguity_covariance(alternatives: Float) -> Float:
+    """Covariance (3, 3) to add where the view fits elsewhere about as well.
+
+    Spread of a mixture about its best component, weighted by exp(-cost).
+    """
+    p, offset = np.exp(-alternatives[:, 3]), alternatives[:, :3]
+    return np.asarray(np.einsum("r,ri,rj->ij", p / p.sum(), offset, offset))
 
 
 def _sliding_covariance(

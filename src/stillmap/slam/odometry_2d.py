@@ -120,7 +120,8 @@ class _ScanOdometry:
         if poor and self.search_wider:
             match, evidence = front_end.search_wider(grid, scan, s, prior, alternative, match)
         front_end.weigh(t, match.T_map_base, seconds, evidence)
-        is_fault = self._contradicts_odometry(t, prior, match.T_map_base)
+        leaps = self.steps is not None and not self.steps.plausible[t - 1]
+        is_fault = leaps or match.contradicts_odometry
         self._record(t, match, is_fault=is_fault)
         self._note_drift(t, motion, match, seconds)
         if is_seen:
@@ -150,12 +151,6 @@ class _ScanOdometry:
         if not self.steps.plausible[t - 1]:
             return guess, None, measured
         return measured, self.front_end.follow_odometry(increment, learned=True), guess
-
-    def _contradicts_odometry(self, t: int, prior: MotionPrior, T_map_base: Float) -> bool:
-        """True if odometry leaps before scan t, or its prior does not lead to the pose (3, 3)."""
-        if self.steps is None:
-            return False
-        return not self.steps.plausible[t - 1] or is_inconsistent(prior, T_map_base)
 
     def _start_segment(self, t: int, prior: MotionPrior) -> None:
         """Starts a new local map where the prior leads: loop closure decides where it belongs."""

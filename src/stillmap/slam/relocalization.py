@@ -62,10 +62,9 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         previous, by_odometry = first, segment.follow_odometry()
         best = by_odometry
         if not best.is_likely:
-            places = list(segment.find_places())
-            best = _most_likely(by_odometry, *places)
-            if not best.is_likely:
-                best = _most_likely(by_odometry, *map(segment.without_odometry, places))
+            best = _most_likely(by_odometry, *segment.find_places())
+            if not best.is_likely:  # nothing proves that the robot was carried
+                best = _most_likely(by_odometry, segment.continue_motion())
         if best.is_likely or best is not by_odometry:
             covariance = np.zeros((3, 3))
             poses[first:] = se2.normalize(best.C @ poses[first:])

@@ -86,6 +86,18 @@ class Segment:
         """The segment where odometry leads, within its covariance."""
         return self._follow(np.eye(3), self._first, self._covariance)
 
+    def continue_motion(self) -> Placement:
+        """The segment within reach of the last scan before it, if odometry failed in between."""
+        context, t = self._context, self._first
+        seconds = 1e-9 * np.diff(context.recording.stamp_ns[: t + 1])
+        speed = float(context.travelled[t - 1]) / max(float(seconds[:-1].sum()), 1e-9)
+        std = max(0.5 * speed * float(seconds[-1]), MIN_LEAP)  # along an axis, of a disk
+        prior = gaussian_prior(context.poses[t - 1], std, UNIFORM_ROTATION)
+        scan, usual = context.hits(t), float(context.explained[t])
+        T = scan_matching.match_scan(self._map, scan, prior, usual).T_map_base
+        placement = self._follow(T @ se2.inverse(context.poses[t]), t, np.zeros((3, 3)))
+        return dataclasses.replace(placement, motion_cost=scan_matching.FAULT_COST + prior.cost(T))
+
     def find_places(self) -> Iterator[Placement]:
         """Places at which keyframes fit, near odometry or elsewhere."""
         closures = list(self._match_places())
@@ -98,16 +110,6 @@ class Segment:
                 is_elsewhere=motion_cost > _CARRIED_COST,
                 closures=[same for same in closures if self._is_same(placement.C, same)],
             )
-
-    def without_odometry(self, placement: Placement) -> Placement:
-        """The same hypothesis if odometry failed: the robot is within reach of its last pose."""
-        context, t = self._context, self._first
-        seconds = 1e-9 * np.diff(context.recording.stamp_ns[: t + 1])
-        speed = float(context.travelled[t - 1]) / max(float(seconds[:-1].sum()), 1e-9)
-        std = max(0.5 * speed * float(seconds[-1]), MIN_LEAP)  # along an axis, of a disk
-        prior = gaussian_prior(context.poses[t - 1], std, UNIFORM_ROTATION)
-        cost = scan_matching.FAULT_COST + prior.cost(placement.C @ context.poses[t])
-        return dataclasses.replace(placement, motion_cost=cost, is_elsewhere=False)
 
     def _follow(self, C: Float, start: int, covariance: Float) -> Placement:
         """Keyframes matched with the map one after the other, from `start` on, then backwards.
@@ -134,7 +136,8 @@ class Segment:
                 match = scan_matching.match_scan(self._map, scan, prior, usual)
                 if match.explained >= loop_verification.MIN_EXPLAINED:
                     poses[t] = T = match.T_map_base
-                    moved, spread = T @ se2.inverse(context.poses[t]), np.zeros((3, 3))
+                    moved = T @ se2.inverse(context.poses[t])
+                    spread = match.covariance + _drift_covariance(0.0)
                     if C_first is None:
                         C_first = moved
                         cost += scan_matching.motion_cost(prior, match)
@@ -213,16 +216,20 @@ def transfer_covariance(
     x, y, _ = step if C is None else C @ step
     lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     blind = context.drift[min(i, j) + 1 : max(i, j) + 1].sum(axis=0)
-    out: Float = lever @ covariance @ lever.T + blind
-    return out
+    return np.asarray(lever @ covariance @ lever.T + blind)
 
 
 def _drifted_prior(T_map_base: Float, covariance: Float, metres: float) -> MotionPrior:
     """The prior about a pose (3, 3) with a covariance (3, 3) and the drift of so many metres."""
-    translation, rotation = drift_std(metres)
-    total = covariance + np.diag(np.square([translation, translation, rotation]))
+    total = covariance + _drift_covariance(metres)
     std = float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[1])), float(np.sqrt(total[2, 2]))
     return MotionPrior(se2.normalize(T_map_base), np.linalg.inv(total), *std, is_odometry=True)
+
+
+def _drift_covariance(metres: float) -> Float:
+    """(3, 3) of x, y, heading after so many metres of travel."""
+    translation, rotation = drift_std(metres)
+    return np.diag(np.square([translation, translation, rotation]))
 
 
 def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
@@ -237,12 +244,10 @@ def _range_signature(context: LoopContext, t: int) -> Float:
     hit = recording.hit[beams]
     ranges = np.linalg.norm(context.hits(t).points, axis=1)
     total = np.histogram(ranges, _RANGE_BINS, weights=context.e[beams][hit])[0].cumsum()
-    shares: Float = total / max(float(total[-1]), 1e-9)
-    return shares
+    return np.asarray(total / max(float(total[-1]), 1e-9))
 
 
 def _select_evenly(keyframes: Index, max_count: int) -> list[int]:
     """At most `max_count` of them, evenly spread."""
     which = np.unique(np.linspace(0, len(keyframes) - 1, max_count).round().astype(int))
-    out: list[int] = keyframes[which].tolist()
-    return out
+    return [int(t) for t in keyframes[which]]
