@@ -222,8 +222,9 @@ def transfer_covariance(
 def _drifted_prior(T_map_base: Float, covariance: Float, metres: float) -> MotionPrior:
     """The prior about a pose (3, 3) with a covariance (3, 3) and the drift of so many metres."""
     total = covariance + _drift_covariance(metres)
+    information = np.asarray(np.linalg.inv(total), np.float64)
     std = float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[1])), float(np.sqrt(total[2, 2]))
-    return MotionPrior(se2.normalize(T_map_base), np.linalg.inv(total), *std, is_odometry=True)
+    return MotionPrior(se2.normalize(T_map_base), information, *std, is_odometry=True)
 
 
 def _drift_covariance(metres: float) -> Float:
