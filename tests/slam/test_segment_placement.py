@@ -9,6 +9,7 @@ from driven import driven
 from stillmap.core import se2
 from stillmap.sim.walls import box
 from stillmap.slam.relocalization import relocalize_segments
+from stillmap.slam.scan_matching import FAULT_COST
 from stillmap.slam.segment_placement import Segment
 
 NARROW = np.diag(np.square([0.3, 0.3, 0.05]))
@@ -46,7 +47,8 @@ def test_evidence_prefers_the_right_place():
     followed = Segment(shifted, first, last, NARROW).follow_odometry()
     np.testing.assert_allclose(followed.C @ shifted.poses[first], context.poses[first], atol=0.03)
     assert 0.8 * right.score < followed.score < right.score
-    far = Segment(moved(context, first, 3.0, 2.0, 0.7), first, last, 1e-4 * NARROW)
+    far_context = moved(context, first, 3.0, 2.0, 0.7)
+    far = Segment(far_context, first, last, 1e-4 * NARROW)
     assert not far.follow_odometry().is_likely
     place = max(far.find_places(), key=lambda placement: placement.score)
     assert place.is_likely
@@ -54,7 +56,8 @@ def test_evidence_prefers_the_right_place():
     assert place.score < right.score
     driven = far.continue_motion()  # from its last pose: odometry failed
     assert not driven.is_elsewhere
-    assert driven.motion_cost < 20.0 < place.motion_cost
+    assert FAULT_COST < driven.motion_cost < 0.5 * place.motion_cost
+    np.testing.assert_allclose(driven.C @ far_context.poses[first], context.poses[first], atol=0.03)
 
 
 def test_what_follows_a_segment_moves_with_it():

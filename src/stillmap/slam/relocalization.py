@@ -32,7 +32,7 @@ class Relocalization:
         context: the trajectory with all segments in place.
         closures: that connect them.
         breaks: first scans of segments that do not follow by odometry.
-        ambiguous: first scans of segments that contradict the map where odometry leads, and fit
+        ambiguous: first scans of segments that contradict the map where they lie, and fit
             nowhere else.
     """
 
@@ -59,8 +59,8 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         context = dataclasses.replace(context, poses=poses)
         covariance = transfer_covariance(context, covariance, previous, first)
         segment = Segment(context, first, last, covariance)
-        previous, by_odometry = first, segment.follow_odometry()
-        best = by_odometry
+        previous = first
+        best = by_odometry = segment.follow_odometry()
         if not best.is_likely:
             best = _most_likely(by_odometry, *segment.find_places())
             if not best.is_likely:  # nothing proves that the robot was carried

@@ -12,9 +12,9 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.array_types import Float, Index
-from stillmap.slam import loop_verification, scan_matching
+from stillmap.slam import loop_verification, motion_model, scan_matching
 from stillmap.slam.loop_candidates import drift_std
-from stillmap.slam.motion_model import MIN_LEAP, UNIFORM_ROTATION, MotionPrior, gaussian_prior
+from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.trajectory_cost import same_place_evidence
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
@@ -89,14 +89,15 @@ class Segment:
     def continue_motion(self) -> Placement:
         """The segment within reach of the last scan before it, if odometry failed in between."""
         context, t = self._context, self._first
-        seconds = 1e-9 * np.diff(context.recording.stamp_ns[: t + 1])
-        speed = float(context.travelled[t - 1]) / max(float(seconds[:-1].sum()), 1e-9)
-        std = max(0.5 * speed * float(seconds[-1]), MIN_LEAP)  # along an axis, of a disk
-        prior = gaussian_prior(context.poses[t - 1], std, UNIFORM_ROTATION)
-        scan, usual = context.hits(t), float(context.explained[t])
-        T = scan_matching.match_scan(self._map, scan, prior, usual).T_map_base
-        placement = self._follow(T @ se2.inverse(context.poses[t]), t, np.zeros((3, 3)))
-        return dataclasses.replace(placement, motion_cost=scan_matching.FAULT_COST + prior.cost(T))
+        before, gap = (1e-9 * np.diff(context.recording.stamp_ns[[0, t - 1, t]])).tolist()
+        reach = gap * float(context.travelled[t - 1]) / max(before, 1e-9)
+        # 0.5: along an axis of a disk
+        stds = max(0.5 * reach, motion_model.MIN_INCREMENT_STD[0]), motion_model.UNIFORM_ROTATION
+        prior = motion_model.gaussian_prior(context.poses[t - 1], *stds)
+        match = scan_matching.match_scan(self._map, context.hits(t), prior, context.explained[t])
+        C = match.T_map_base @ se2.inverse(context.poses[t])
+        cost = scan_matching.FAULT_COST + scan_matching.motion_cost(prior, match)
+        return dataclasses.replace(self._follow(C, t, np.zeros((3, 3))), motion_cost=cost)
 
     def find_places(self) -> Iterator[Placement]:
         """Places at which keyframes fit, near odometry or elsewhere."""
@@ -186,11 +187,9 @@ class Segment:
         """One closure per hypothesis, those that explain most."""
         kept = list[LoopClosure]()
         for closure in sorted(closures, key=lambda closure: -closure.explained):
-            if len(kept) == _MAX_HYPOTHESES:
-                break
             if not any(self._is_same(self._motion(better), closure) for better in kept):
                 kept.append(closure)
-        return kept
+        return kept[:_MAX_HYPOTHESES]
 
     def _is_same(self, C: Float, closure: LoopClosure) -> bool:
         """True if a closure asks for that motion (3, 3) of the segment."""

@@ -92,7 +92,7 @@ class Diagnostics(ShortRepr):
         breaks: first scans after the robot was carried elsewhere; before loop closure, those
             before which it may have been.
         segments: first scans of all segments that were placed, those that follow by odometry too.
-        ambiguous: first scans of segments that contradict the map where odometry leads, and fit
+        ambiguous: first scans of segments that contradict the map where they lie, and fit
             nowhere else.
         bare_stretches: whose length the scans do not show, and no accepted loop measures.
         follows_odometry: scan matching makes a less likely map than odometry.
