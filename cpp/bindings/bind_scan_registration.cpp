@@ -94,14 +94,13 @@ auto register_scan(const OccupancyGrid<2>& grid, const Points<2>& points,
                    const Information& information, double sigma, int radius, double floor,
                    double unknown, double information_scale, int max_iterations,
                    double window_translation, double window_rotation, double search_range,
-                   int max_candidates, double min_score, const std::optional<OnePose<2>>& T_start,
+                   int max_candidates, const std::optional<OnePose<2>>& T_start,
                    const std::optional<Points<2>>& normals,
                    const std::optional<Flat<float>>& isotropy) {
   require(max_candidates >= 1, "max_candidates: expected at least one");
   const ScanRegistrationOptions options{
       {sigma, radius, floor, unknown}, information_scale, max_iterations};
   require(information_scale > 0.0, "information_scale: expected a positive number");
-  require_probability(min_score, "min_score");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
   auto beams = beams_from(points, weights);
@@ -119,7 +118,7 @@ auto register_scan(const OccupancyGrid<2>& grid, const Points<2>& points,
   {
     nb::gil_scoped_release released;
     LikelihoodField field(grid, options.field);
-    const SearchWindow window{window_translation, window_rotation, search_range, min_score};
+    const SearchWindow window{window_translation, window_rotation, search_range};
     CorrelativeSearch search(grid, beams, prior, window, options);
     const auto starting_poses = given ? std::vector<Candidate>{{*given, 0.0}}
                                       : search.best(static_cast<size_t>(max_candidates));
@@ -193,24 +192,23 @@ auto gradient_at(const OccupancyGrid<2>& grid, const Points<2>& points, const Fl
 }
 
 void bind_registration(nb::module_& m) {
-  m.def("register_scan", &register_scan, nb::arg("grid"), nb::arg("points").noconvert(),
-        nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
-        nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
-        nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"),
-        nb::arg("max_iterations"), nb::arg("window_translation"), nb::arg("window_rotation"),
-        nb::arg("search_range"), nb::arg("max_candidates"), nb::arg("min_score") = 0.0,
-        nb::arg("T_start") = nb::none(), nb::arg("normals").noconvert() = nb::none(),
-        nb::arg("isotropy").noconvert() = nb::none(),
-        "Equation (9): scan-to-map registration. points (N, 2) float32: end points of returns in "
-        "the moving frame; weights (N,) float32 = e; T_prior (3, 3) and information (3, 3) "
-        "of (translation, rotation about the origin of the moving frame). A correlative search "
-        "yields up to max_candidates poses, each refined by Newton steps; none that scores less "
-        "than min_score of the highest possible score, in which case T_prior is refined. With "
-        "T_start the search is skipped. Returns pose, covariance, cost, inlier share, number of "
-        "Newton steps, number of scored lattice poses, and (R, dof + 1) offset and additional cost "
-        "of each refined "
-        "candidate against the best. With normals (N, 2) and isotropy (N,) of `estimate_normals`, "
-        "the covariance is that of the surfaces' directions, and wide along a bare wall.");
+  m.def(
+      "register_scan", &register_scan, nb::arg("grid"), nb::arg("points").noconvert(),
+      nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
+      nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
+      nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"), nb::arg("max_iterations"),
+      nb::arg("window_translation"), nb::arg("window_rotation"), nb::arg("search_range"),
+      nb::arg("max_candidates"), nb::arg("T_start") = nb::none(),
+      nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
+      "Equation (9): scan-to-map registration. points (N, 2) float32: end points of returns in "
+      "the moving frame; weights (N,) float32 = e; T_prior (3, 3) and information (3, 3) "
+      "of (translation, rotation about the origin of the moving frame). A correlative search "
+      "yields up to max_candidates poses, each refined by Newton steps; T_prior if no pose stands "
+      "out. With T_start the search is skipped. Returns pose, covariance, cost, inlier share, "
+      "number of Newton steps, number of scored lattice poses, and (R, dof + 1) offset and "
+      "additional cost of each refined candidate against the best. With normals (N, 2) and "
+      "isotropy (N,) of `estimate_normals`, "
+      "the covariance is that of the surfaces' directions, and wide along a bare wall.");
   m.def("registration_cost", &cost_at, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),

@@ -95,8 +95,10 @@ def match_scan(
     """
     if not prior.is_odometry:  # all that is known: its mean may lie beside another optimum
         return search_within_prior(grid, scan, prior)
-    match = _match_within_prior(grid, scan, prior if learned is None else learned, usual)
-    if learned is not None and len(scan.points) and is_poor(match, usual):
+    narrow = learned or prior
+    match = _match_within_prior(grid, scan, narrow, usual)
+    is_wider = (prior.information != narrow.information).any()
+    if is_wider and len(scan.points) and is_poor(match, usual):
         wider = _match_within_prior(grid, scan, prior, usual)
         match = wider if wider.cost < match.cost - MIN_GAIN else match
     return _loosen_prior(grid, scan, prior, match)
@@ -234,8 +236,7 @@ def is_inconsistent(prior: MotionPrior, T_map_base: Float) -> bool:
 def is_narrow(prior: MotionPrior) -> bool:
     """True if the window of a prior is no wider than the first of the wider searches."""
     stds = prior.translation_std, prior.rotation_std
-    widest = zip(stds, _WIDE_WINDOWS[0], strict=True)
-    return all(_SEARCH_STDS * std <= half for std, half in widest)
+    return all(_SEARCH_STDS * std <= half for std, half in zip(stds, _WIDE_WINDOWS[0], strict=True))
 
 
 def search_pose(

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
 #include <optional>
 #include <queue>
 #include <vector>
@@ -22,7 +21,6 @@ struct SearchWindow {
   double translation;  // metres, half width along each axis
   double rotation;     // radians, half width about the vertical axis
   double max_range;    // metres, longer beams are ignored
-  double min_score;    // share of the highest possible score below which no pose counts
 };
 
 struct Candidate {
@@ -55,9 +53,6 @@ class CorrelativeSearch {
     std::nth_element(ranges.begin(), far_range, ranges.end());
     angle_step_ = std::min(step_ / std::max(*far_range, step_), 0.035);
     half_angles_ = static_cast<int>(std::ceil(window.rotation / angle_step_));
-    min_score_ = window.min_score * options.information_scale *
-                 std::log((options.field.floor + 1.0) / options.field.floor) / kWeight *
-                 static_cast<double>(std::accumulate(weights_.begin(), weights_.end(), int64_t{0}));
     while (top_level_ < kMaxTopLevel && (2 << top_level_) <= half_steps_) ++top_level_;
     const Eigen::Matrix2d A = prior.information.topLeftCorner<2, 2>();
     const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen(A);
@@ -66,16 +61,15 @@ class CorrelativeSearch {
   }
 
   // Best lattice poses, best first, pairwise in different basins and none below 0.8 of the best
-  // score; the prior's mean if the window is empty or no pose reaches the lowest score.
+  // score; the prior's mean if the window is empty or no pose stands out.
   std::vector<Candidate> best(size_t max_candidates) {
     if (points_.empty() || (half_steps_ == 0 && half_angles_ == 0)) return {{prior_.pose, 0.0}};
     build_pyramid();
     std::vector<Candidate> candidates;
-    size_t limit = std::numeric_limits<size_t>::max();
+    size_t limit = kMaxReads / std::max(points_.size(), kMinPoints);
     while (!queue_.empty() && candidates.size() < max_candidates && poses_tried_ < limit) {
       const Node node = queue_.top();
       queue_.pop();
-      if (node.bound < min_score_) break;
       if (!candidates.empty() && node.bound < 0.8 * candidates.front().score) break;
       if (node.level > 0) {
         branch(node);
@@ -87,7 +81,7 @@ class CorrelativeSearch {
         continue;
       candidates.push_back(candidate);
       // the other candidates may take as many poses as the best one
-      if (candidates.size() == 1) limit = 2 * poses_tried_;
+      if (candidates.size() == 1) limit = std::min(limit, 2 * poses_tried_);
     }
     if (candidates.empty()) candidates.push_back({prior_.pose, 0.0});
     return candidates;
@@ -98,6 +92,9 @@ class CorrelativeSearch {
  private:
   static constexpr double kWeight = 255.0;
   static constexpr int kMaxTopLevel = 6;
+  // about a second, in which every place that stood out was found in recorded logs; with few points
+  // they bound the memory of the nodes
+  static constexpr size_t kMaxReads = size_t{1} << 30, kMinPoints = 256;
 
   // All shifts within 2^level steps of `low` along each axis, at one angle.
   struct Node {
@@ -207,7 +204,6 @@ class CorrelativeSearch {
   double step_ = 0.0;
   int32_t half_steps_ = 0;
   double angle_step_ = 0.0;
-  double min_score_ = 0.0;  // nats
   int half_angles_ = 0;
   int top_level_ = 0;  // level of the root nodes
   std::optional<FieldPyramid> pyramid_;
