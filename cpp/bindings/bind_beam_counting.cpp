@@ -5,6 +5,7 @@
 #include "stillmap/occupancy/beam_counting.hpp"
 #include "stillmap/occupancy/no_return_beams.hpp"
 #include "stillmap/registration/endpoint_interpolation.hpp"
+#include "stillmap/registration/evidence_counting.hpp"
 
 namespace stillmap::bindings {
 namespace {
@@ -12,11 +13,11 @@ namespace {
 template <int D>
 void add(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, int threads,
-         bool remove) {
+         bool remove, bool hits_only) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
   nb::gil_scoped_release released;
-  add_beams<D>(grid, scans, weights, remove ? -1 : 1, threads);
+  add_beams<D>(grid, scans, weights, remove ? -1 : 1, threads, hits_only);
 }
 
 template <int D>
@@ -54,6 +55,27 @@ void add_no_return(OccupancyGrid<D>* grid, OccupancyGrid<D>* rest, const Points<
   nb::gil_scoped_release released;
   const double cells_to_end = end_margin / (grid ? grid : rest)->resolution();
   add_no_return_beams<D>(grid, rest, scans, {cells, cells_to_end}, threads);
+}
+
+void near_returns(OccupancyGrid<2>& grid, const Points<2>& points, const Flat<bool>& hit,
+                  const Flat<float>& e, const Flat<int64_t>& offset, const Poses<2>& poses,
+                  const Flat<int64_t>& selected, double correlation_length,
+                  const OccupancyGrid<2>* other, bool everywhere) {
+  const auto all = scans_from<2>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  require(correlation_length > 0.0, "correlation_length: expected a positive length in metres");
+  require(!grid.with_moments(), "grid: expected one without moments");
+  require(!other || other->resolution() == grid.resolution(),
+          "other: expected the same resolution");
+  std::vector<Scans<2>> scans;
+  for (size_t k = 0; k < selected.shape(0); ++k) {
+    const auto t = static_cast<size_t>(selected.data()[k]);
+    require(t < all.n_scans, "scans: out of range");
+    scans.push_back({all.points, all.hit, all.offset + t, all.poses + 9 * t, 1});
+  }
+  nb::gil_scoped_release released;
+  ReturnTiles tiles(grid, other, everywhere);
+  count_near_returns(grid, scans, weights, correlation_length, tiles);
 }
 
 template <int D>
@@ -94,9 +116,9 @@ void bind(nb::module_& m) {
   m.def("add_beams", &add<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1, nb::kw_only(),
-        nb::arg("remove") = false,
-        "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
-        "it subtracts the same sums exactly.");
+        nb::arg("remove") = false, nb::arg("hits_only") = false,
+        "Adds the sums alpha, beta of (10) of all beams to the grid, or of those with a return; e "
+        "(M,) float32. With remove it subtracts the same sums exactly.");
   m.def("add_end_points", &ends<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("remove") = false,
@@ -129,6 +151,14 @@ void bind(nb::module_& m) {
 void bind_beam_counting(nb::module_& m) {
   bind<2>(m);
   bind<3>(m);
+  m.def("count_near_returns", &near_returns, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("scans").noconvert(), nb::kw_only(),
+        nb::arg("correlation_length"), nb::arg("other").none() = nb::none(),
+        nb::arg("everywhere") = false,
+        "Adds the sums of (10) of some scans (n,) int64 that the evidence of a map needs: e of the "
+        "end points times `evidence_shares`, and the lengths of beams near returns of these scans "
+        "or of another grid, or everywhere.");
   m.def("interpolate_end_points", &fill, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("max_gap"),

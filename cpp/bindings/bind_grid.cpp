@@ -151,7 +151,6 @@ void bind(nb::module_& m, const char* name) {
       .def_prop_ro("resolution", &G::resolution, "metres")
       .def_prop_ro("approach", &G::approach, "metres")
       .def_prop_ro("dimension", [](const G&) { return D; })
-      .def_prop_ro("memory_bytes", &G::memory_bytes)
       .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")
       .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
            "(K, 2) float64: sums alpha, beta of cells (K, D) int64; 0, 0 for unobserved cells.")
@@ -175,19 +174,13 @@ void bind(nb::module_& m, const char* name) {
 
 // Visitor that records the cells and chord lengths of a traversal.
 template <int D>
-struct Recorder {
-  Cell<D> cell = Cell<D>::Zero();
+struct Recorder : CellTracker<D> {
   std::vector<int64_t> cells;
   std::vector<double> lengths;
 
-  void start(const Cell<D>& first) { cell = first; }
   void visit(double length) {
-    for (int d = 0; d < D; ++d) cells.push_back(cell[d]);
+    for (int d = 0; d < D; ++d) cells.push_back(this->cell[d]);
     lengths.push_back(length);
-  }
-  template <int Axis>
-  void step(int32_t direction) {
-    cell[Axis] += direction;
   }
 };
 

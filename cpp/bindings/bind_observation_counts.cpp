@@ -76,7 +76,6 @@ void bind(nb::module_& m, const char* name) {
       .def_prop_ro("resolution", &L::resolution, "metres")
       .def_prop_ro("radius", &L::radius, "metres")
       .def_prop_ro("dimension", [](const L&) { return D; })
-      .def_prop_ro("memory_bytes", &L::memory_bytes)
       .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("is_dynamic").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::arg("time_bin").noconvert(),

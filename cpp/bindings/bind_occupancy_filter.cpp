@@ -238,7 +238,6 @@ nb::class_<Filter> bind_filter(nb::module_& m, const char* name, const char* doc
           "are in cells, max_log_ratio in nats.")
       .def_prop_ro("resolution", &Filter::resolution, "Edge of a cell, metres.")
       .def_prop_ro("size", &Filter::size, "Number of cells in which beams ended.")
-      .def_prop_ro("memory_bytes", &Filter::memory_bytes)
       .def("label", &label<Filter>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
            nb::arg("threads") = 1,

@@ -208,7 +208,6 @@ void bind_3d(nb::module_& m) {
            nb::arg("max_weight"))
       .def("__len__", &NdtMap<D>::size)
       .def_prop_ro("levels", &NdtMap<D>::levels)
-      .def_prop_ro("memory_bytes", &NdtMap<D>::memory_bytes)
       .def("add", &add_points<D>, nb::arg("points").noconvert(), nb::arg("weights").noconvert(),
            nb::arg("T_map_base").noconvert(),
            "Adds points (N, D) float32 in the frame of T_map_base, weights (N,) float32 = e.")

@@ -68,7 +68,6 @@ def test_counts_without_moments(beams):
         _core.add_beams(grid, *beams.weighted, threads)
         for one, other in zip(grid.dense(), with_moments.dense(), strict=True):
             np.testing.assert_array_equal(one, other)
-        assert grid.memory_bytes < with_moments.memory_bytes
     with pytest.raises(ValueError, match="moments"):
         kind(beams.resolution, 0.5, moments=False)
 

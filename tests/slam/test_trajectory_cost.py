@@ -1,6 +1,7 @@
 """Cost of steps given odometry, and evidence of maps, against plain twins."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -80,8 +81,17 @@ def test_evidence_gain_is_that_of_beta_distributions():
     recording, poses = simulation.recording, simulation.truth.T_world_base
     e = np.random.default_rng(0).uniform(size=recording.n_beams).astype(np.float32)
     halves = np.split(np.arange(len(poses)), [12])
-    first, second = (scan_hits.count_beams(recording, e, k, poses[k], 0.1) for k in halves)
-    together = scan_hits.count_beams(recording, e, range(len(poses)), poses, 0.1)
+    count = partial(scan_hits.count_beams, recording, e, resolution=0.1)
+    first, second = (count(scans=k, poses=poses[k], everywhere=True) for k in halves)
+    near = count(scans=halves[1], poses=poses[halves[1]], other=first)
+    together = count(scans=np.arange(len(poses)), poses=poses, everywhere=True)
+    weights, every_beam = e.copy(), _core.OccupancyGrid2D(0.1)
+    for beams in map(recording.beams_of, range(recording.n_scans)):
+        hit = recording.hit[beams]
+        weights[beams][hit] *= scan_hits.evidence_shares(recording.points[beams][hit])
+    data = recording.points, recording.hit, weights, recording.offset
+    _core.add_beams(every_beam, *data, recording.T_map_sensor(poses))
+    np.testing.assert_allclose(together.dense()[1:], every_beam.dense()[1:], atol=1e-6)
     counts = [np.array(grid.dense(*together.bounding_box())[1:]) for grid in (first, second)]
     both = (counts[0].sum(axis=0) > 0.0) & (counts[1].sum(axis=0) > 0.0)
     has_hits = both & (sum(counts)[0] > 0.0)
@@ -94,6 +104,8 @@ def test_evidence_gain_is_that_of_beta_distributions():
         expected = evidence[0] - evidence[1] - evidence[2]
         assert first.evidence_gain(second, a, b) == pytest.approx(expected, rel=1e-9)
         assert second.evidence_gain(first, a, b) == pytest.approx(expected, rel=1e-9)
+        assert first.evidence_gain(near, a, b) == pytest.approx(expected, rel=1e-9)
+        assert near.log_evidence(a, b) == pytest.approx(second.log_evidence(a, b), rel=1e-9)
     with pytest.raises(ValueError, match="resolution"):
         first.evidence_gain(_core.OccupancyGrid2D(0.05), 1.0, 1.0)
     with pytest.raises(ValueError, match="pseudo-counts"):

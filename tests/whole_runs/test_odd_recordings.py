@@ -154,8 +154,7 @@ def require_run(one, said):
             run_in_python(one, Path(name))
         else:
             run_commands(one, Path(name), said)
-        left = [entry.name for entry in Path(name).iterdir() if entry.name.startswith(".")]
-        assert [entry for entry in left if not entry.endswith(".resume")] == []
+        assert [e.name for e in Path(name).glob(".*") if not e.name.endswith(".resume")] == []
 
 
 @runs(25)

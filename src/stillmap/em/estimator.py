@@ -141,11 +141,9 @@ def add_recording(
     """
     release = [] if e is None else [e]
     for _, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=release):
-        if hits_only:
-            points = np.where(hit[:, None], points, np.float32(np.nan))
         weights = np.ones(len(hit), np.float32) if e is None else e[beams]
         used = counting_threads(len(hit), threads)
-        _core.add_beams(grid, points, hit, weights, offset, T, used)
+        _core.add_beams(grid, points, hit, weights, offset, T, used, hits_only=hits_only)
 
 
 def recount_as_static(grid: Grid, recording: Recording, poses: Float, e: Float32) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.core.array_types import Float, Float32
+from stillmap.core.array_types import Float, Float32, Index
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
 from stillmap.slam.loop_candidates import drift_std
@@ -74,7 +74,8 @@ class Submap:
     @functools.cached_property
     def counts(self) -> _core.OccupancyGrid2D:
         """The counts (10), without end points interpolated between beams: these are no evidence."""
-        return self._context.count_beams(self._scans, self._context.poses[self._scans])
+        poses = self._context.poses[self._scans]
+        return self._context.count_beams(self._scans, poses, everywhere=True)
 
 
 def verify_candidate(
@@ -105,7 +106,8 @@ def verify_candidate(
     covariance = match.covariance + np.diag(np.square(floor))
     score, rejected = 0.0, "explains too little"
     if match.explained >= MIN_EXPLAINED:
-        own = context.count_beams(view.scans, match.T_map_base @ view.to_keyframe)
+        poses = match.T_map_base @ view.to_keyframe
+        own = context.count_beams(view.scans, poses, other=submap.counts)
         of_motion = dataclasses.replace(match, covariance=covariance)
         score = same_place_evidence(submap.counts, own)
         score -= scan_matching.motion_cost(prior, of_motion)
@@ -138,7 +140,7 @@ class _View(NamedTuple):
         before_ends: (N, 2) points before their ends, see `_points_before_ends`.
     """
 
-    scans: list[int]
+    scans: Index
     to_keyframe: Float
     hits: Scan
     before_ends: Float32
@@ -164,7 +166,7 @@ def _collect_view(context: LoopContext, t: int) -> _View:
     return _View(scans, to_t, hits, np.concatenate(before))
 
 
-def _select_around(context: LoopContext, t: int, metres: float) -> list[int]:
+def _select_around(context: LoopContext, t: int, metres: float) -> Index:
     """Scan t, and one per `_VIEW_SPACING` m of travel up to `metres` to either side."""
     here, count = context.travelled[t], round(metres / _VIEW_SPACING)
     at = here + _VIEW_SPACING * np.arange(-count, count + 1)
@@ -172,7 +174,7 @@ def _select_around(context: LoopContext, t: int, metres: float) -> list[int]:
     scans = np.where(at < here, np.minimum(after, t), np.maximum(after - 1, t))
     # no farther than asked: travel may leap
     near = np.abs(context.travelled[scans] - here) <= metres
-    return sorted({t, *scans[near].tolist()})
+    return np.union1d(scans[near], t)
 
 
 def _merge_scans(scans: list[Scan], to_t: Float) -> Scan:

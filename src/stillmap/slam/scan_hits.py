@@ -1,7 +1,7 @@
 """The hits of a scan as registration takes them, and their part in maps for registration."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -110,17 +110,15 @@ def add_hits(
     remove: bool = False,
 ) -> None:
     """As `add_scan`, of points (N, 2) in the sensor frame with weights e (N,)."""
-    T, all_hit, offset = T_map_sensor[None], hit[hit], np.array([0, np.count_nonzero(hit)])
-    _core.add_beams(grid, points[hit], all_hit, weights[hit], offset, T, remove=remove)
-    _core.interpolate_end_points(
-        grid, points, hit, weights, np.array([0, len(hit)]), T, **INTERPOLATION, remove=remove
-    )
+    scan = points, hit, weights, np.array([0, len(hit)]), T_map_sensor[None]
+    _core.add_beams(grid, *scan, remove=remove, hits_only=True)
+    _core.interpolate_end_points(grid, *scan, **INTERPOLATION, remove=remove)
 
 
 def count_beams(
-    recording: Recording, e: Float32, scans: Iterable[int], poses: Float, resolution: float
+    recording: Recording, e: Float32, scans: Index, poses: Float, resolution: float, **near: Any
 ) -> _core.OccupancyGrid2D:
-    """The counts (10) of some scans.
+    """The counts (10) of some scans that the evidence of a map needs: near its returns.
 
     Args:
         recording: 2D.
@@ -128,14 +126,13 @@ def count_beams(
         scans: (n,) that are added to the map.
         poses: (n, 3, 3) of their robot.
         resolution: m of a cell.
+        near: `other` map, near whose returns they are needed, too, or `everywhere`.
     """
     grid = _core.OccupancyGrid2D(resolution, moments=False)
-    for t, pose in zip(recording.iter_scans(scans, e), poses, strict=True):
-        beams = recording.beams_of(t)
-        points, hit, weights = recording.points[beams], recording.hit[beams], e[beams].copy()
-        weights[hit] *= evidence_shares(points[hit])
-        T = pose @ recording.T_base_sensor[recording.sensor[t]]
-        _core.add_beams(grid, points, hit, weights, np.array([0, len(hit)]), T[None])
+    T_map_sensor = np.zeros((recording.n_scans, 3, 3))
+    T_map_sensor[scans] = poses @ recording.T_base_sensor[recording.sensor[scans]]
+    data = recording.points, recording.hit, e, recording.offset, T_map_sensor, np.asarray(scans)
+    _core.count_near_returns(grid, *data, correlation_length=CORRELATION_LENGTH, **near)
     return grid
 
 

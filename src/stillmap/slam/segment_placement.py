@@ -80,7 +80,8 @@ class Segment:
         scans = context.recording.iter_scans(self._earlier.tolist(), context.e)
         self._map = context.build_map(scans)
         # without end points interpolated between beams, which would count as evidence
-        self._counts = context.count_beams(self._earlier, context.poses[self._earlier])
+        poses = context.poses[self._earlier]
+        self._counts = context.count_beams(self._earlier, poses, everywhere=True)
 
     def follow_odometry(self) -> Placement:
         """The segment where odometry leads, within its covariance."""
@@ -144,7 +145,8 @@ class Segment:
                         cost += scan_matching.motion_cost(prior, match)
                     else:  # its prior is as wide in an unknown place
                         cost += prior.cost(T)
-        own = context.count_beams(self._tested, np.array([poses[t] for t in self._tested]))
+        tested = np.array([poses[t] for t in self._tested])
+        own = context.count_beams(np.array(self._tested), tested, other=self._counts)
         gain = same_place_evidence(self._counts, own)
         return Placement(C if C_first is None else C_first, C_first is not None, gain, cost)
 

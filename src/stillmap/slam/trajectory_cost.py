@@ -36,6 +36,7 @@ def map_evidence(
     for shift in (0.0, 0.5 * resolution):
         shifted = se2.matrix(shift, shift, 0.0) @ poses
         grid = scan_hits.count_beams(recording, e, scans, shifted, resolution)
+        recording.release_pages(e)
         evidence += 0.5 * INFORMATION_SCALE * grid.log_evidence(*_PRIOR)
     return evidence
 

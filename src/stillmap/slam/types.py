@@ -177,6 +177,6 @@ class LoopContext:
             scan_hits.add_scan(grid, self.recording, self.e, t, self.poses[t])
         return grid
 
-    def count_beams(self, scans: Iterable[int], poses: Float) -> _core.OccupancyGrid2D:
-        """The counts (10) of some of the scans, at poses (n, 3, 3)."""
-        return scan_hits.count_beams(self.recording, self.e, scans, poses, self.resolution)
+    def count_beams(self, scans: Index, poses: Float, **near: Any) -> _core.OccupancyGrid2D:
+        """The counts (10) of some of the scans, at poses (n, 3, 3), as of `scan_hits`."""
+        return scan_hits.count_beams(self.recording, self.e, scans, poses, self.resolution, **near)

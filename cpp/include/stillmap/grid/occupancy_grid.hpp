@@ -122,13 +122,6 @@ class OccupancyGrid : public BlockLayout<D> {
     return *block.moments;
   }
 
-  size_t memory_bytes() const {
-    size_t bytes = blocks_.size() * (sizeof(Block) + 64);
-    for (const auto& block : blocks_)
-      if (block->moments) bytes += sizeof(*block->moments);
-    return bytes;
-  }
-
  private:
   double resolution_;
   double approach_;

@@ -63,4 +63,16 @@ inline double traverse(const Vec<D>& start, const Vec<D>& end, Visitor& visitor)
   return length > travelled ? length - travelled : 0.0;
 }
 
+// What visitors for `traverse` have in common that follow the cell themselves.
+template <int D>
+struct CellTracker {
+  void start(const Cell<D>& first) { cell = first; }
+  template <int Axis>
+  void step(int32_t direction) {
+    cell[Axis] += direction;
+  }
+
+  Cell<D> cell = Cell<D>::Zero();
+};
+
 }  // namespace stillmap

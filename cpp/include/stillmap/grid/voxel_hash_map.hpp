@@ -65,11 +65,6 @@ class VoxelHashMap {
     rehash(slots);
   }
 
-  size_t memory_bytes() const {
-    return values_.capacity() * sizeof(Value) + cells_.capacity() * sizeof(Cell<D>) +
-           slots_.capacity() * sizeof(Slot);
-  }
-
  private:
   static constexpr size_t kMinSlots = 64;
 

@@ -21,7 +21,7 @@ namespace stillmap {
 
 // Sums the lengths on the approach to an end point, without the end cell.
 template <int D>
-class ApproachAccumulator {
+class ApproachAccumulator : public CellTracker<D> {
  public:
   ApproachAccumulator(OccupancyGrid<D>& grid, Fixed sign)
       : cursor_(grid), cells_(grid.approach() / grid.resolution()), sign_(sign) {}
@@ -34,21 +34,16 @@ class ApproachAccumulator {
     traverse<D>(start, beam.end, *this);
   }
 
-  void start(const Cell<D>& first) { cell_ = first; }
   void visit(double length) {
-    auto& moments = OccupancyGrid<D>::moments_of(*cursor_.block(cell_));
-    moments[static_cast<size_t>(BlockLayout<D>::local_of(cell_))][D] += sign_ * to_fixed(length);
-  }
-  template <int Axis>
-  void step(int32_t direction) {
-    cell_[Axis] += direction;
+    auto& moments = OccupancyGrid<D>::moments_of(*cursor_.block(this->cell));
+    const auto local = static_cast<size_t>(BlockLayout<D>::local_of(this->cell));
+    moments[local][D] += sign_ * to_fixed(length);
   }
 
  private:
   BlockCursor<OccupancyGrid<D>> cursor_;
   double cells_;
   Fixed sign_;
-  Cell<D> cell_ = Cell<D>::Zero();
 };
 
 // Adds a return with P(static) = p_static to its end cell.
@@ -65,16 +60,17 @@ inline void add_end_point(typename OccupancyGrid<D>::Block& block, const Cell<D>
 }
 
 // Adds alpha_j and beta_j of (10) for the scans [first, last). With sign -1 it removes scans that
-// were added before, exactly, since sums are integers.
+// were added before, exactly, since sums are integers. hits_only: without beams without a return.
 template <int D>
 inline void add_scans(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
-                      size_t first, size_t last) {
+                      size_t first, size_t last, bool hits_only = false) {
   BlockCursor<OccupancyGrid<D>> cursor(grid);
   // second sum of beta_j: chord length of the beam in j, independent of e
   RayWalker walker(cursor,
                    [=](CellCounts* j, double length) { j->beta += sign * to_fixed(length); });
   ApproachAccumulator<D> approach(grid, sign);
   for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
+    if (hits_only && !scans.hit[n]) return;
     const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
     traverse<D>(beam.start, beam.end, walker);
     if (!scans.hit[n])
@@ -101,12 +97,12 @@ inline void add_end_points(OccupancyGrid<D>& grid, const Scans<D>& scans, const 
 
 template <int D>
 inline void add_beams(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
-                      int threads) {
+                      int threads, bool hits_only) {
   const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
   std::vector<OccupancyGrid<D>> others;
   for (size_t i = 2; i < bounds.size(); ++i) others.push_back(grid.sibling());
   parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
-    add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, sign, first, last);
+    add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, sign, first, last, hits_only);
   });
   for (const auto& other : others) grid.merge(other);
 }

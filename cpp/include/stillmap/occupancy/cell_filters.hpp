@@ -48,9 +48,6 @@ class CellFilters {
   const FilterOptions& options() const { return options_; }
   size_t classes() const { return options_.rho.size(); }
   size_t size() const { return filters_.size(); }
-  size_t memory_bytes() const {
-    return filters_.capacity() * sizeof(Filter) + state_.capacity() * sizeof(float);
-  }
   int32_t tag(int32_t k) const { return filters_[static_cast<size_t>(k)].tag; }
 
   // A new filter, after the passes of a cell in which no beam ended so far, see `initialize`.

@@ -38,9 +38,6 @@ class FilterMap : public BlockMap<D, CellValue> {
 
   double resolution() const { return resolution_; }
   size_t size() const { return filters_.size(); }
-  size_t memory_bytes() const {
-    return this->blocks().size() * (sizeof(Block) + 64) + filters_.memory_bytes();
-  }
 
   // P(static) of the cell in which a beam ended, or of the best one within the hit radius;
   // `otherwise` where no beam ended before.

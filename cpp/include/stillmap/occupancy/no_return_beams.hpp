@@ -66,7 +66,7 @@ class NoReturnBeams : private CellIndex<D> {
   // leaves it within end_margin of its end or after a stop cell; isolated beams are not trusted at
   // all.
   template <class Visit>
-  class BeamWalk {
+  class BeamWalk : public CellTracker<D> {
    public:
     BeamWalk(const NoReturnBeams& beams, Visit visit)
         : stop_cells_(beams), end_margin_(beams.end_margin_), visit_(std::move(visit)) {}
@@ -77,28 +77,22 @@ class NoReturnBeams : private CellIndex<D> {
       traverse<D>(beam.start, beam.end, *this);
     }
 
-    void start(const Cell<D>& first) { cell_ = first; }
     void visit(double length) {
       travelled_ += length;
       if (travelled_ > trusted_range_ || at_stop_cell()) trusted_range_ = 0.0;
-      visit_(cell_, length, trusted_range_ > 0.0);
-    }
-    template <int Axis>
-    void step(int32_t direction) {
-      cell_[Axis] += direction;
+      visit_(this->cell, length, trusted_range_ > 0.0);
     }
 
    private:
     bool at_stop_cell() {
-      const auto* block = stop_cells_.block(cell_);
-      return block && block->values[static_cast<size_t>(BlockLayout<D>::local_of(cell_))] !=
-                          CellIndex<D>::kNone;
+      const auto* block = stop_cells_.block(this->cell);
+      const auto local = static_cast<size_t>(BlockLayout<D>::local_of(this->cell));
+      return block && block->values[local] != CellIndex<D>::kNone;
     }
 
     BlockCursor<const CellIndex<D>> stop_cells_;
     double end_margin_;
     Visit visit_;
-    Cell<D> cell_ = Cell<D>::Zero();
     double trusted_range_ = 0.0, travelled_ = 0.0;
   };
 

@@ -67,8 +67,6 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
     return BlockMap<D, CellVisits>::find_or_add(block, CellVisits{});
   }
 
-  size_t memory_bytes() const { return this->blocks().size() * (sizeof(Block) + 64); }
-
   // is_dynamic (M,): returns from moving objects. time_bin (T,): time bin of each scan,
   // non-decreasing and later than in previous calls.
   void add(const Scans<D>& scans, const bool* is_dynamic, const int64_t* time_bin, int threads) {

@@ -54,12 +54,6 @@ class NdtMap {
   double edge(int level) const { return std::ldexp(edge_, level); }
   size_t size() const { return tables_.front().size(); }
 
-  size_t memory_bytes() const {
-    size_t bytes = 0;
-    for (const auto& table : tables_) bytes += table.memory_bytes();
-    return bytes;
-  }
-
   void add(const Vec<D>& point, double weight) {
     for (int level = 0; level < levels(); ++level) {
       const Vec<D> x = point / edge(level);

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 #include <array>
-#include <memory>
 #include <vector>
 
 #include "stillmap/grid/occupancy_grid.hpp"
@@ -60,20 +59,10 @@ inline ScanBeams beams_of(const Scans<2>& scans, const float* e, size_t t) {
 inline void add_hits(OccupancyGrid<2>& grid, const ScanBeams& scan, const Pose<2>& T_map_base,
                      Fixed sign, const InterpolationOptions& options) {
   const auto T = row_major(T_map_base * scan.T_base_sensor);
-  std::vector<float> points, e;
-  for (int64_t n = 0; n < scan.n_beams; ++n) {
-    if (!scan.hit[n]) continue;
-    points.insert(points.end(), {scan.points[2 * n], scan.points[2 * n + 1]});
-    e.push_back(scan.e[n]);
-  }
-  const std::unique_ptr<bool[]> all_hit(new bool[e.size() + 1]);
-  std::fill(all_hit.get(), all_hit.get() + e.size(), true);
-  const std::array<int64_t, 2> of_hits = {0, static_cast<int64_t>(e.size())};
-  const std::array<int64_t, 2> of_all = {0, scan.n_beams};
-  const Scans<2> hits{points.data(), all_hit.get(), of_hits.data(), T.data(), 1};
-  add_scans<2>(grid, hits, e.data(), sign, 0, 1);
-  const Scans<2> all{scan.points, scan.hit, of_all.data(), T.data(), 1};
-  EndPointInterpolator(grid, all, scan.e, sign, options).add();
+  const std::array<int64_t, 2> offset = {0, scan.n_beams};
+  const Scans<2> beams{scan.points, scan.hit, offset.data(), T.data(), 1};
+  add_scans<2>(grid, beams, scan.e, sign, 0, 1, true);
+  EndPointInterpolator(grid, beams, scan.e, sign, options).add();
 }
 
 // The hits of a scan with their normals, in the base frame.
