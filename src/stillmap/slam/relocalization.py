@@ -64,7 +64,8 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         if not best.is_likely:
             best = _most_likely(by_odometry, *segment.find_places())
             if not best.is_likely:  # nothing proves that the robot was carried
-                best = _most_likely(by_odometry, segment.continue_motion())
+                continued = segment.continue_motion()
+                best = _most_likely(by_odometry, continued) if continued.is_matched else by_odometry
         if best.is_likely or best is not by_odometry:
             covariance = np.zeros((3, 3))
             poses[first:] = se2.normalize(best.C @ poses[first:])

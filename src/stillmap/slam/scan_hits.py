@@ -15,7 +15,7 @@ from stillmap.core.recording import Recording
 FREE_SPACE_MARGIN = 0.5  # m before its end in which a beam is not used as free space
 # gaps between neighboring end points on a surface that are filled: at most m wide, m that three of
 # them may be off a straight line, times the gap beside it
-INTERPOLATION = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
+INTERPOLATION: dict[str, Any] = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
 # normals of a scan: m to either side that belong to one surface, m between its end points; ratio of
 # the variances across and along up to which it is flat, and from which it is a corner
 NORMALS = {"radius": 0.3, "max_gap": 1.0, "flat_below": 0.1, "round_from": 0.4}
