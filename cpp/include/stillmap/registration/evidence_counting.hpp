@@ -24,9 +24,9 @@ class ReturnTiles {
 
   // other: a second map, may be nullptr. everywhere: all tiles, whatever the maps hold.
   ReturnTiles(const OccupancyGrid<2>& grid, const OccupancyGrid<2>* other, bool everywhere)
-      : grid_(grid), other_(other), everywhere_(everywhere) {}
+      : everywhere(everywhere), grid_(grid), other_(other) {}
 
-  bool everywhere() const { return everywhere_; }
+  const bool everywhere;
 
   // The maps may get more free space, but no returns, between calls.
   uint64_t mask_of(const Cell<2>& block) {
@@ -51,7 +51,6 @@ class ReturnTiles {
 
   const OccupancyGrid<2>& grid_;
   const OccupancyGrid<2>* other_;
-  bool everywhere_;
   std::unordered_map<uint64_t, uint64_t, BlockLayout<2>::Hash> masks_;
 };
 
@@ -62,7 +61,7 @@ class TileWalker : public CellTracker<2> {
       : tiles_(tiles), cursor_(grid), walker_(cursor_, AddLength()) {}
 
   void add(const BeamSegment<2>& beam) {
-    if (tiles_.everywhere()) {
+    if (tiles_.everywhere) {
       traverse<2>(beam.start, beam.end, walker_);
       return;
     }
@@ -70,17 +69,15 @@ class TileWalker : public CellTracker<2> {
     beam_ = &beam;
     direction_ = (beam.end - beam.start).normalized();
     travelled_ = 0.0;
+    was_inside_ = false;
     traverse<2>(beam.start * tiles, beam.end * tiles, *this);
-    if (is_inside()) traverse<2>(position(), beam.end, walker_);
+    enter();
+    if (was_inside_) traverse<2>(first_, beam.end, walker_);
   }
 
   void visit(double length) {
-    const Vec<2> first = position();
+    enter();
     travelled_ += length * ReturnTiles::kEdge;
-    if (is_inside()) {
-      const double rest = traverse<2>(first, position(), walker_);
-      AddLength()(walker_.value(), rest);
-    }
   }
 
  private:
@@ -88,11 +85,20 @@ class TileWalker : public CellTracker<2> {
     void operator()(CellCounts* j, double length) const { j->beta += to_fixed(length); }
   };
 
-  bool is_inside() {
-    const Cell<2> block(cell[0] >> 3, cell[1] >> 3);  // `cell` is a tile
+  // Follows the beam through the tiles before `cell`, which is a tile, if that is none of them.
+  void enter() {
+    const Cell<2> block(cell[0] >> 3, cell[1] >> 3);
     if (block != block_) mask_ = tiles_.mask_of(block);
     block_ = block;
-    return mask_ & ReturnTiles::bit_of(cell);
+    const bool is_inside = mask_ & ReturnTiles::bit_of(cell);
+    if (is_inside == was_inside_) return;
+    if (is_inside) {
+      first_ = position();
+    } else {
+      const double rest = traverse<2>(first_, position(), walker_);
+      AddLength()(walker_.value(), rest);
+    }
+    was_inside_ = is_inside;
   }
   Vec<2> position() const { return beam_->start + travelled_ * direction_; }
 
@@ -100,8 +106,9 @@ class TileWalker : public CellTracker<2> {
   BlockCursor<OccupancyGrid<2>> cursor_;
   RayWalker<OccupancyGrid<2>, AddLength> walker_;
   const BeamSegment<2>* beam_ = nullptr;
-  Vec<2> direction_ = Vec<2>::Zero();
-  double travelled_ = 0.0;                                       // cells
+  Vec<2> direction_ = Vec<2>::Zero(), first_ = Vec<2>::Zero();
+  double travelled_ = 0.0;  // cells
+  bool was_inside_ = false;
   Cell<2> block_ = Cell<2>::Constant(BlockLayout<2>::kMaxCell);  // no block
   uint64_t mask_ = 0;                                            // of the block
 };
