@@ -42,10 +42,10 @@ class ReturnTiles {
 
  private:
   static uint64_t mask_of(const OccupancyGrid<2>& grid, const Cell<2>& block) {
-    const auto* found = grid.find(block);
+    const auto* stored = grid.find(block);
     uint64_t tiles = 0;
-    for (size_t local = 0; found && local < found->values.size(); ++local)  // 32 rows of 32 cells
-      tiles |= uint64_t{found->values[local].alpha > 0} << ((local >> 2 & 7) | local >> 7 << 3);
+    for (size_t local = 0; stored && local < stored->values.size(); ++local)  // 32 rows of 32 cells
+      tiles |= uint64_t{stored->values[local].alpha > 0} << ((local >> 2 & 7) | local >> 7 << 3);
     return tiles;
   }
 
