@@ -20,6 +20,15 @@ def drive(
     return simulate(override(scene, {"crowd": {"people": people}, **sections}), seed)
 
 
+SMALL_ROOM = (*box(0, 0, 8, 6), *box(1.5, 1.5, 0.8, 0.6), *box(-2.0, 1.8, 1.0, 0.4))
+
+
+def drive_small_room(seed: int, beams: int, scans: int) -> Simulation:
+    """A run through a room of 8 x 6 m with two people."""
+    laser = {"beams": beams, "range_noise": 0.01, "max_range": 7.0}
+    return drive(seed, SMALL_ROOM, people=2, laser=laser, robot={"scans": scans})
+
+
 def shown(result: Any, cells: Any) -> Any:
     """p_occupied of cells (K, 2) of the map frame."""
     first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)

@@ -8,13 +8,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
+from rooms import drive_small_room
 
 from stillmap.cli.main import main
-from stillmap.sim import Scene, simulate, write_simulation
-from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
-from stillmap.sim.walls import box
+from stillmap.sim import write_simulation
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -73,22 +71,11 @@ def on_a_terminal(start: Callable[..., subprocess.Popen[str]]) -> Callable[..., 
     return run
 
 
-def _room(beams: int, scans: int) -> Scene:
-    return Scene(
-        "room",
-        walls=(*box(0, 0, 8, 6), *box(1.5, 1.5, 0.8, 0.6), *box(-2.0, 1.8, 1.0, 0.4)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
-        crowd=CrowdOptions(people=2),
-        laser=LaserOptions(beams=beams, range_noise=0.01, max_range=7.0),
-        robot=RobotOptions(scans=scans),
-    )
-
-
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording folder: a room of 8 x 6 m with two people, 40 scans of 120 beams."""
     path = tmp_path_factory.mktemp("recording") / "room"
-    write_simulation(simulate(_room(120, 40), np.random.default_rng(1)), path)
+    write_simulation(drive_small_room(1, 120, 40), path)
     return path
 
 
@@ -105,7 +92,7 @@ def mapped(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with 1000 scans of 360 beams: an iteration takes long enough to be stopped in."""
     path = tmp_path_factory.mktemp("recording") / "hall"
-    write_simulation(simulate(_room(360, 1000), np.random.default_rng(1)), path)
+    write_simulation(drive_small_room(1, 360, 1000), path)
     return path
 
 

@@ -8,28 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import distributed
-import numpy as np
 import pytest
 import stand_in as stand_ins
 from fleet_processes import NAMES, wait_until
 from result_contents import contents
+from rooms import drive_small_room
 
 from stillmap.cli.main import main
-from stillmap.sim import Scene, simulate, write_simulation
-from stillmap.sim.options import CrowdOptions, LaserOptions, RobotOptions
-from stillmap.sim.walls import box
-
-
-def _record(path: Path, seed: int, scans: int) -> None:
-    scene = Scene(
-        path.name,
-        walls=(*box(0, 0, 8, 6), *box(1.5, 1.5, 0.8, 0.6), *box(-2.0, 1.8, 1.0, 0.4)),
-        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
-        crowd=CrowdOptions(people=2),
-        laser=LaserOptions(beams=120, range_noise=0.01, max_range=7.0),
-        robot=RobotOptions(scans=scans),
-    )
-    write_simulation(simulate(scene, np.random.default_rng(seed)), path)
+from stillmap.sim import write_simulation
 
 
 @pytest.fixture(scope="session")
@@ -37,7 +23,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of three recordings: a room of 8 x 6 m, 40 scans of 120 beams each."""
     folder = tmp_path_factory.mktemp("recordings")
     for seed, name in enumerate(NAMES):
-        _record(folder / name, seed, 40)
+        write_simulation(drive_small_room(seed, 120, 40), folder / name)
     return folder
 
 

@@ -65,7 +65,9 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
             best = _most_likely(by_odometry, *segment.find_places())
             if not best.is_likely:  # nothing proves that the robot was carried
                 continued = segment.continue_motion()
-                best = _most_likely(by_odometry, continued) if continued.is_matched else by_odometry
+                # where no keyframe fits, the cost of fitting is not paid: no rival of where some do
+                is_rival = continued.is_matched or not by_odometry.is_matched
+                best = _most_likely(by_odometry, continued) if is_rival else by_odometry
         if best.is_likely or best is not by_odometry:
             covariance = np.zeros((3, 3))
             poses[first:] = se2.normalize(best.C @ poses[first:])

@@ -95,9 +95,8 @@ def match_scan(
     """
     if not prior.is_odometry:  # all that is known: its mean may lie beside another optimum
         return search_within_prior(grid, scan, prior)
-    narrow = learned or prior
-    match = _match_within_prior(grid, scan, narrow, usual)
-    is_wider = (prior.information != narrow.information).any()
+    match = _match_within_prior(grid, scan, learned or prior, usual)
+    is_wider = learned is not None and (prior.information != learned.information).any()
     if is_wider and len(scan.points) and is_poor(match, usual):
         wider = _match_within_prior(grid, scan, prior, usual)
         match = wider if wider.cost < match.cost - MIN_GAIN else match

@@ -92,7 +92,7 @@ class CorrelativeSearch {
  private:
   static constexpr double kWeight = 255.0;
   static constexpr int kMaxTopLevel = 6;
-  // about a second, in which every place that stood out was found in recorded logs; with few points
+  // about a second of reading; in recorded logs few searches take a third of that. With few points
   // they bound the memory of the nodes
   static constexpr size_t kMaxReads = size_t{1} << 30, kMinPoints = 256;
 
